@@ -1,0 +1,1 @@
+"""One process, one UAV: it senses, decides, moves, and ships a flight record every T_u."""

@@ -1,0 +1,1 @@
+"""The traffic management centre, and what all parties agree on."""

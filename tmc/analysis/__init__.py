@@ -1,0 +1,1 @@
+"""What a finished run says: metrics, figures and the report, all rebuilt from the log."""

@@ -1,0 +1,349 @@
+"""The one configuration: every setting with its default, unit and source. Files, options and log metadata derive from it.
+
+The defaults are the paper's (Table I and Sec. IV), so the preset `paper` changes nothing. A setting is named by its
+dotted key, such as `dqn.gamma`; `overfly run --set dqn.gamma=0.95` and the TOML presets use these same keys.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be: one sentence with the key and the mend."""
+
+
+def _s(default: Any, about: str, unit: str = "", source: str = "") -> Any:
+    """A setting: its default, what it is, its unit, and where in the paper (or in our decisions) it comes from."""
+    return field(default=default, metadata={"about": about, "unit": unit, "source": source})
+
+
+@dataclass(frozen=True)
+class World:
+    map: str = _s("downtown-toronto", "built-in map, or a text raster file", source="Sec. IV-A, Fig. 2(a)")
+    roads: Literal["major", "main", "arterial", "all"] = _s(
+        "main", "which classes of street are monitored", source="Sec. IV-A"
+    )
+    obstacles: Literal["none", "static", "event-day"] = _s(
+        "static", "static obstacles and no-fly cells", source="Sec. II-A"
+    )
+    alpha: float = _s(0.01, "rate of event arrival in a road cell", "events/tick", "Sec. IV-A")
+    rates: str = _s("uniform", "relative rates by road cell: uniform, volume or blend", source="Sec. IV-A: uniform")
+    alpha_offroad: float = _s(
+        0.0, "rate in cells that are no road", "events/tick", "Sec. II: the roads are what is monitored"
+    )
+    start: Literal["free", "road"] = _s(
+        "free", "cells that UAVs start on, distinct and at random", source="Algorithm 1: random positions"
+    )
+    initial_map: Literal["visited", "random"] = _s(
+        "visited", "uncertainty at t = 0: zero, or uniform in (0, 1)", source="Fig. 4(b): random"
+    )
+
+
+@dataclass(frozen=True)
+class Team:
+    size: int = _s(3, "N, the number of UAVs", "UAVs", "Sec. IV-C")
+    sensing_range: float = _s(1.5, "r_s in scenario II", "cell widths d", "Sec. IV-B")
+
+
+@dataclass(frozen=True)
+class Comms:
+    period: int = _s(10, "T_u between two exchanges with the TMC; scenario I always has 1", "ticks", "Sec. II-C")
+    phase: Literal["together", "staggered"] = _s(
+        "together", "all UAVs exchange at t mod T_u = 0, or UAV i at floor(i T_u / N)", source="Algorithm 1; Sec. II-C"
+    )
+    patience: float = _s(30.0, "silence after which the TMC names a UAV that others wait for", "s")
+
+
+@dataclass(frozen=True)
+class Reward:
+    collision: float = _s(-20.0, "r^c of a blocked move, instead of any other reward", source="Sec. IV-B")
+    new_cell: float = _s(1.0, "r^n of a cell not visited so far in the episode", source="Sec. IV-B")
+    weight: float = _s(5.0, "lambda, the weight of r^u in eq. (11)", source="Sec. IV-B")
+    uncertainty: Literal["true", "own"] = _s(
+        "true", "r^u of the true map, written by the TMC, or of the UAV's own", source="Sec. III-B: r^u = u_k(t)"
+    )
+    novelty: Literal["own", "team"] = _s(
+        "own", "r^n counts the UAV's own visits, or the team's", source="Sec. III-B, left open"
+    )
+    aligned: bool = _s(
+        False, "r^u = u_k / (1 - gamma q_k), the team's objective for uneven rates", source="docs/adr/0006"
+    )
+
+
+@dataclass(frozen=True)
+class Exploration:
+    start: float = _s(0.5, "epsilon in the first episode", source="Table I")
+    end: float = _s(0.05, "epsilon in the last episodes", source="Table I")
+    fraction: float = _s(0.8, "share of the episodes over which epsilon falls linearly", source="left open")
+    mask_blocked: bool = _s(
+        False, "never choose a move that is known to be blocked (grid, obstacles, sensed UAVs)", source="ours"
+    )
+
+
+@dataclass(frozen=True)
+class Observation:
+    view: Literal["whole", "ego"] = _s("whole", "the whole grid, or a square around the UAV", source="eq. (10): whole")
+    radius: int = _s(8, "half width of the egocentric view: 2 radius + 1 cells", "cells")
+    near: int = _s(0, "also feed the (2 near + 1)^2 cells around the UAV to the dense layer; 0: off", "cells")
+
+
+@dataclass(frozen=True)
+class Network:
+    channels: tuple[int, ...] = _s((16, 32), "filters of each convolution", source="Fig. 2(b), not available")
+    kernel: int = _s(4, "width of the filters", "cells", "Table I")
+    stride: int = _s(2, "stride of the convolutions", "cells", "left open")
+    dense: int = _s(64, "units of the fully connected layer", source="Table I")
+
+
+@dataclass(frozen=True)
+class DQN:
+    learning_rate: float = _s(1e-3, "Adam's step size", source="Table I")
+    batch: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I")
+    gamma: float = _s(0.99, "discount factor", "1/tick", "Table I")
+    n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (12): 1")
+    double: bool = _s(False, "choose a' by the online network (double Q-learning)", source="eq. (12): no")
+    loss: Literal["mse", "huber"] = _s("mse", "loss of Q against its target", source="eq. (13)")
+    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (11): 1")
+    target_episodes: int = _s(5, "f: copy theta to theta- every f episodes; 0: off", "episodes", "Table I")
+    target_updates: int = _s(0, "copy theta to theta- every so many updates; 0: off", "updates")
+
+
+@dataclass(frozen=True)
+class Replay:
+    capacity: int = _s(100_000, "transitions that the replay memory holds", "transitions", "Table I")
+    learn_start: int = _s(128, "transitions before the first minibatch", "transitions", "left open: b")
+    updates_per_tick: float = _s(1.0, "minibatches a tick of the team", "updates/tick", "Algorithm 1: one")
+    slack: int = _s(200, "how far ticks and updates may drift apart before the limiter holds one back", "ticks")
+
+
+@dataclass(frozen=True)
+class Training:
+    episodes: int = _s(500, "E, episodes", "episodes", "Table I")
+    ticks: int = _s(1000, "T_ep, ticks in an episode", "ticks of 60 s", "Table I")
+    seed: int = _s(1, "key of every random draw")
+    push_every: int = _s(100, "updates between two policies pushed to the TMC", "updates", "left open")
+    checkpoint_every: int = _s(5000, "updates between two checkpoints", "updates")
+    threads: int = _s(1, "threads of the learner's arithmetic", "threads")
+
+
+@dataclass(frozen=True)
+class Journal:
+    flush: float = _s(0.5, "longest time that a logged message stays in the process", "s")
+    chunk: int = _s(262_144, "size of an MCAP chunk before compression", "bytes")
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a mission. Immutable; `check` has been passed by every instance that `build` returns."""
+
+    scenario: int = _s(2, "1: continuous communication, 2: limited communication", source="Sec. II-B")
+    world: World = field(default_factory=World)
+    team: Team = field(default_factory=Team)
+    comms: Comms = field(default_factory=Comms)
+    reward: Reward = field(default_factory=Reward)
+    exploration: Exploration = field(default_factory=Exploration)
+    observation: Observation = field(default_factory=Observation)
+    network: Network = field(default_factory=Network)
+    dqn: DQN = field(default_factory=DQN)
+    replay: Replay = field(default_factory=Replay)
+    training: Training = field(default_factory=Training)
+    journal: Journal = field(default_factory=Journal)
+
+    @property
+    def T_u(self) -> int:
+        """Ticks between two exchanges; scenario I is continuous communication, so 1 (Sec. II-C)."""
+        return 1 if self.scenario == 1 else self.comms.period
+
+    def phase(self, uav: int) -> int:
+        """UAV `uav` exchanges with the TMC at t mod T_u = phase."""
+        return uav * self.T_u // self.team.size if self.comms.phase == "staggered" else 0
+
+    def due(self, uav: int, t: int) -> bool:
+        """True when UAV `uav` ships its record at tick t: at its phase, and at the episode's end."""
+        return t % self.T_u == self.phase(uav) or t == self.training.ticks
+
+    def epsilon(self, episode: int) -> float:
+        """Exploration rate of an episode (counted from 1): linear over the first `fraction` of all episodes."""
+        e, span = self.exploration, self.exploration.fraction * (self.training.episodes - 1)
+        done = 1.0 if span <= 0 else min((episode - 1) / span, 1.0)
+        return e.start + (e.end - e.start) * done
+
+
+# (key, lowest, highest): ranges that hold whatever the rest says.
+RANGES: tuple[tuple[str, float, float], ...] = (
+    ("scenario", 1, 2),
+    ("world.alpha", 1e-9, 10.0),
+    ("world.alpha_offroad", 0.0, 10.0),
+    ("team.size", 1, 1000),
+    ("team.sensing_range", 0.0, 1000.0),
+    ("comms.period", 1, 60_000),
+    ("comms.patience", 0.1, 1e6),
+    ("reward.collision", -1e6, 1e6),
+    ("reward.new_cell", -1e6, 1e6),
+    ("reward.weight", -1e6, 1e6),
+    ("exploration.start", 0.0, 1.0),
+    ("exploration.end", 0.0, 1.0),
+    ("exploration.fraction", 0.0, 1.0),
+    ("observation.radius", 1, 100),
+    ("observation.near", 0, 100),
+    ("network.kernel", 1, 64),
+    ("network.stride", 1, 64),
+    ("network.dense", 1, 65_536),
+    ("dqn.learning_rate", 1e-12, 10.0),
+    ("dqn.batch", 1, 65_536),
+    ("dqn.gamma", 0.0, 1.0),
+    ("dqn.n_step", 1, 1000),
+    ("dqn.reward_scale", 1e-9, 1e9),
+    ("dqn.target_episodes", 0, 1_000_000),
+    ("dqn.target_updates", 0, 1_000_000_000),
+    ("replay.capacity", 1, 1_000_000_000),
+    ("replay.learn_start", 1, 1_000_000_000),
+    ("replay.updates_per_tick", 0.0, 1000.0),
+    ("replay.slack", 1, 1_000_000),
+    ("training.episodes", 1, 10_000_000),
+    ("training.ticks", 1, 60_000),
+    ("training.seed", 0, 2**63 - 1),
+    ("training.push_every", 1, 1_000_000_000),
+    ("training.checkpoint_every", 1, 1_000_000_000),
+    ("training.threads", 1, 1024),
+    ("journal.flush", 0.01, 60.0),
+    ("journal.chunk", 1024, 64 * 1024 * 1024),
+)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One row of the table of settings."""
+
+    key: str
+    type: Any
+    default: Any
+    about: str
+    unit: str
+    source: str
+
+
+def settings() -> Iterator[Setting]:
+    """Every setting, in the order of the classes above."""
+    yield from _settings(Config, "")
+
+
+def _settings(cls: type, prefix: str) -> Iterator[Setting]:
+    hints = get_type_hints(cls)
+    for f in dataclasses.fields(cls):
+        kind = hints[f.name]
+        if dataclasses.is_dataclass(kind):
+            yield from _settings(kind, f"{f.name}.")  # type: ignore[arg-type]  # a class, not an instance
+        else:
+            yield Setting(prefix + f.name, kind, f.default, **f.metadata)
+
+
+SETTINGS: Mapping[str, Setting] = types.MappingProxyType({s.key: s for s in settings()})
+
+
+def get(config: Config, key: str) -> Any:
+    """The value of a dotted key."""
+    value: Any = config
+    for name in key.split("."):
+        value = getattr(value, name)
+    return value
+
+
+def flat(config: Config) -> dict[str, Any]:
+    """All settings as {dotted key: value}; tuples become lists, so that it goes through JSON and TOML unchanged."""
+    values = {key: get(config, key) for key in SETTINGS}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+
+
+def build(values: Mapping[str, Any], base: Config | None = None) -> Config:
+    """`base` (the paper's config by default) with dotted keys replaced, each converted to its type, all checked."""
+    config = base or Config()
+    for key, value in values.items():
+        config = _replace(config, key, _convert(_setting(key), value))
+    check(config)
+    return config
+
+
+def _setting(key: str) -> Setting:
+    if key in SETTINGS:
+        return SETTINGS[key]
+    last = key.rsplit(".", 1)[-1]
+    near = [k for k in SETTINGS if k.rsplit(".", 1)[-1] == last or k.startswith(f"{key}.")]
+    hint = f"did you mean {' or '.join(near)}?" if near else "`overfly doctor --settings` lists them"
+    raise ConfigError(f"there is no setting '{key}': {hint}")
+
+
+def _replace(config: Config, key: str, value: Any) -> Config:
+    group, _, name = key.rpartition(".")
+    if not group:
+        return dataclasses.replace(config, **{name: value})
+    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **{name: value})})
+
+
+def _convert(setting: Setting, value: Any) -> Any:
+    """A value from TOML, JSON or the command line (a string) in the setting's own type."""
+    kind, key = setting.type, setting.key
+    try:
+        if get_origin(kind) is Literal:
+            if value not in get_args(kind):
+                raise ConfigError(f"{key} = {value!r} is none of {', '.join(map(str, get_args(kind)))}")
+            return value
+        if get_origin(kind) is tuple:
+            items = value.split(",") if isinstance(value, str) else value
+            return tuple(int(v) for v in items)
+        if kind is bool:
+            return _as_bool(value)
+        if kind is int:
+            return _as_int(value)
+        if kind is float:
+            number = float(value)
+            if isinstance(value, bool) or not math.isfinite(number):
+                raise ValueError
+            return number
+        return str(value)
+    except ConfigError:
+        raise
+    except (TypeError, ValueError):
+        name = getattr(kind, "__name__", str(kind))
+        raise ConfigError(
+            f"{key} = {value!r} is not {'a list of int' if name == 'tuple' else f'of type {name}'}"
+        ) from None
+
+
+def _as_bool(value: Any) -> bool:
+    names = {"true": True, "false": False, "1": True, "0": False, "yes": True, "no": False}
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, str) and value.lower() in names:
+        return names[value.lower()]
+    raise ValueError
+
+
+def _as_int(value: Any) -> int:
+    if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
+        raise ValueError
+    return int(value)
+
+
+def check(config: Config) -> None:
+    """Refuse impossible settings; raises ConfigError with the reason and the mend."""
+    for key, low, high in RANGES:
+        value = get(config, key)
+        if not low <= value <= high:
+            raise ConfigError(f"{key} = {value} is out of range: choose {low:g} to {high:g}")
+    if not config.network.channels or any(not 1 <= c <= 4096 for c in config.network.channels):
+        raise ConfigError("network.channels must list 1 to 4096 filters for at least one convolution")
+    if config.replay.learn_start > config.replay.capacity:
+        raise ConfigError("replay.learn_start is larger than replay.capacity, so learning would never start")
+    if config.dqn.target_episodes == 0 and config.dqn.target_updates == 0:
+        raise ConfigError("dqn.target_episodes and dqn.target_updates are both 0, so the target would never follow")
+    if config.observation.view == "ego" and config.observation.near > config.observation.radius:
+        raise ConfigError("observation.near is larger than observation.radius")
+    if config.observation.view == "whole" and config.observation.near:
+        raise ConfigError("observation.near needs observation.view = ego")

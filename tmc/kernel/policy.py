@@ -1,0 +1,80 @@
+"""What a policy file says of itself: the description inside an ONNX model, so that no policy flies where it cannot."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from tmc.kernel.config import Config
+from tmc.kernel.grid import N_ACTIONS, Grid
+
+FORMAT = 1
+KEY = "overfly"
+"""Name of the metadata entry of the ONNX model that holds the description as JSON."""
+INPUT, OUTPUT = "observation", "q"
+"""Names of the model's input, (batch, channels, height, width) float32, and output, (batch, 9) float32."""
+N_CHANNELS = 3
+
+
+class PolicyError(ValueError):
+    """A policy that cannot fly here: one sentence with the mend."""
+
+
+@dataclass(frozen=True)
+class PolicyCard:
+    """The description. `view`, `radius`, `near`: as in the settings `observation.*` it was trained with."""
+
+    channels: int
+    height: int
+    width: int
+    actions: int
+    view: str
+    radius: int
+    near: int
+    mask_blocked: bool
+    scenario: int
+    version: int
+    updates: int
+    format: int = FORMAT
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @staticmethod
+    def from_json(text: str) -> PolicyCard:
+        try:
+            card = PolicyCard(**json.loads(text))
+        except (TypeError, ValueError):
+            raise PolicyError("the file is not an Overfly policy: its description cannot be read") from None
+        if card.format != FORMAT:
+            raise PolicyError(f"the policy has format {card.format}, this Overfly reads format {FORMAT}")
+        return card
+
+
+def view_shape(config: Config, grid: Grid) -> tuple[int, int, int]:
+    """(channels, height, width) of an observation under these settings."""
+    if config.observation.view == "ego":
+        side = 2 * config.observation.radius + 1
+        return N_CHANNELS, side, side
+    return N_CHANNELS, grid.rows, grid.cols
+
+
+def card_for(config: Config, grid: Grid, version: int, updates: int) -> PolicyCard:
+    """The description of a policy trained with these settings."""
+    channels, height, width = view_shape(config, grid)
+    view = config.observation
+    return PolicyCard(
+        channels, height, width, N_ACTIONS, view.view, view.radius, view.near,
+        config.exploration.mask_blocked, config.scenario, version, updates,
+    )  # fmt: skip
+
+
+def require(card: PolicyCard, config: Config, grid: Grid) -> None:
+    """Raise PolicyError unless a policy with this card can fly a mission with these settings."""
+    shape = view_shape(config, grid)
+    if (card.channels, card.height, card.width) != shape or card.view != config.observation.view:
+        was = f"{card.view} view, {card.channels} channels of {card.height} x {card.width} cells"
+        now = f"{config.observation.view} view, {shape[0]} channels of {shape[1]} x {shape[2]} cells"
+        raise PolicyError(f"the policy was made for {was}, this mission has {now}: choose the map it was trained on")
+    if card.actions != N_ACTIONS:
+        raise PolicyError(f"the policy has {card.actions} actions, a UAV has {N_ACTIONS}")

@@ -1,0 +1,96 @@
+"""The uncertainty of both scenarios (eqs. 1-4), its updates (Sec. II-D), and the average that is minimised (eq. 6).
+
+Scenario II keeps, for every cell, the tick of its last visit `tau_k` and computes
+
+    u_k(t) = 1 - exp(-alpha_k (t - tau_k))                                         (eq. 3)
+
+An initial map that is not "all visited at t = 0" is carried by one factor a cell, `s_k = 1 - u_k(0)`, in force until
+the first visit: u_k(t) = 1 - s_k exp(-alpha_k t). Values come from a table of exp(-alpha n), so that every process, and the
+replay that rebuilds what a UAV saw, gets the same bits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class UncertaintyLaw:
+    """Eq. (3) for a fixed set of cells and rates; holds tables, no state.
+
+    Arguments: `alpha`, shape (K,), events a tick in each cell (0 where nothing is monitored); `ticks`, the longest age
+    that is asked for; `initial`, shape (K,), u_k(0) before any visit, or None when all cells count as visited at t = 0.
+    """
+
+    def __init__(self, alpha: NDArray[np.float64], ticks: int, initial: NDArray[np.float64] | None = None) -> None:
+        self.cells = np.flatnonzero(alpha > 0).astype(np.int32)
+        """The monitored cells k, ascending; all arrays of this class are over these, `R` of them."""
+        self.index = np.full(alpha.size + 1, -1, np.int32)
+        """Shape (K + 1,): where cell k stands in `cells`, or -1."""
+        self.index[self.cells] = np.arange(self.cells.size)
+        rates, self._rate_of = np.unique(alpha[self.cells], return_inverse=True)
+        self._decay = np.exp(-rates[:, None] * np.arange(ticks + 1)[None, :])
+        self._flat = self._decay.ravel()
+        self._offset = (self._rate_of * (ticks + 1)).astype(np.int64)
+        self.q = np.exp(-alpha[self.cells])
+        """Shape (R,): q_k = exp(-alpha_k), what is left of certainty after one tick."""
+        self._s = None if initial is None else 1.0 - initial[self.cells]
+
+    def values(self, last_visit: NDArray[np.integer], t: int | NDArray[np.integer]) -> NDArray[np.float64]:
+        """u_k(t) from the ticks of the last visits. Shapes (..., R) and () or (..., 1) -> (..., R), float64.
+
+        `last_visit` 0 means "not since the start": then the initial map is in force.
+        """
+        left = self._flat[self._offset + (t - last_visit.astype(np.int64))]
+        if self._s is not None:
+            left = np.where(last_visit == 0, self._s * left, left)
+        return np.asarray(1.0 - left)
+
+    def value(self, i: int, last_visit: int, t: int) -> float:
+        """u of the one monitored cell with index `i` in `cells`; the same bits as `values`."""
+        left = float(self._flat[self._offset[i] + t - last_visit])
+        if self._s is not None and last_visit == 0:
+            left *= float(self._s[i])
+        return 1.0 - left
+
+
+def merge(a: NDArray[np.uint16], b: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """The one law of local and global update: the latest visit wins (Sec. II-D).
+
+    Commutative, associative and idempotent, so late, doubled or reordered records cannot corrupt a map.
+    """
+    return np.maximum(a, b)
+
+
+def step_events(
+    active: NDArray[np.bool_], visited: list[int], arrivals: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Scenario I, one slot, in the paper's order: cells visited in [t, t+1) are cleared, then its new events appear.
+
+    Returns e(t+1), shape (K,), and the cells whose event is new in it. An arrival at an active cell adds nothing.
+    """
+    cleared = active.copy()
+    cleared[visited] = False
+    new = np.flatnonzero(arrivals & ~cleared)
+    cleared[new] = True
+    return cleared, new
+
+
+def arrival_probability(alpha: NDArray[np.float64]) -> NDArray[np.float64]:
+    """P(at least one Poisson arrival in a tick) = 1 - exp(-alpha_k), so that both scenarios share alpha."""
+    return -np.expm1(-alpha)
+
+
+def lower_bound(alpha: NDArray[np.float64], uavs: int, ticks: int) -> float:
+    """No team of N UAVs can have a smaller eq. (6) in scenario II, all cells visited at t = 0.
+
+    At each tick at most N cells have age 0, at most N have age 1, and so on; cells not reached yet have age t. The
+    bound pairs the largest ages with the smallest rates, is exact for uniform rates with perfect tours, and ignores
+    where the UAVs stand. Returns the sum over cells, averaged over ticks 1..T.
+    """
+    rates = np.sort(alpha[alpha > 0])[::-1]
+    ages = np.arange(rates.size) // max(uavs, 1)
+    total = 0.0
+    for t in range(1, ticks + 1):
+        total += float(-np.expm1(-rates * np.minimum(ages, t)).sum())
+    return total / ticks

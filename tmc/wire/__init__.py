@@ -1,0 +1,1 @@
+"""The radio: messages, their codec, and the sockets that carry them."""

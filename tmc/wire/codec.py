@@ -1,0 +1,122 @@
+"""Messages to frames and back. The first frame is a msgpack map; large fields follow as frames of their own.
+
+What arrives is untrusted: sizes are limited before anything is unpacked, every field is checked, and whatever is wrong
+ends in a CodecError with the code of the error reply. Nothing else can come out of `decode`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from tmc.wire import fields
+from tmc.wire.messages import MESSAGES, PROTOCOL, Message
+
+HEADER_LIMIT = 4 * 1024 * 1024
+"""Largest first frame, bytes: a flight record of the longest episode fits."""
+_TYPES = {cls.__name__: cls for cls in MESSAGES}
+_FRAMED = ("tensor", "bytes")
+
+
+class CodecError(ValueError):
+    """Frames that are no valid message; `code` is one of the codes of `Error`."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+def encode(message: Message) -> list[Any]:
+    """The frames of a message: bytes, and contiguous arrays that ZeroMQ can send without a copy."""
+    header: dict[str, Any] = {"type": type(message).__name__, "v": PROTOCOL}
+    frames: list[Any] = []
+    for name, rule in fields.rules(type(message)).items():
+        value = getattr(message, name)
+        if rule.kind == "array":
+            header[name] = value.tobytes()
+        elif rule.kind == "tensor":
+            header[name] = list(value.shape)
+            frames.append(np.ascontiguousarray(value))
+        elif rule.kind == "bytes":
+            frames.append(value)
+        else:
+            header[name] = value
+    return [msgpack.packb(header), *frames]
+
+
+def decode(frames: Sequence[Any]) -> Message:
+    """The message in these frames (bytes or buffers); raises CodecError."""
+    header = _header(frames)
+    cls = _message_class(header)
+    values: dict[str, Any] = {}
+    rest = iter(frames[1:])
+    for name, rule in fields.rules(cls).items():
+        present = name in header
+        raw = header.pop(name, None)
+        if rule.kind in _FRAMED:
+            raw = _frame(rest, name, raw, rule)
+        elif rule.kind == "array":
+            raw = _array(raw, name, rule)
+        elif not present:
+            raise CodecError("malformed", f"{cls.__name__}.{name} is missing")
+        values[name] = raw
+    if header or next(rest, None) is not None:
+        raise CodecError("malformed", f"{cls.__name__} has fields or frames that it should not have")
+    try:
+        return cls(**values)
+    except fields.FieldError as error:
+        raise CodecError(error.code, str(error)) from None
+
+
+def _header(frames: Sequence[Any]) -> dict[str, Any]:
+    if not frames or len(frames[0]) > HEADER_LIMIT:
+        raise CodecError("malformed", f"the first frame must have 1 to {HEADER_LIMIT} bytes")
+    try:
+        header = msgpack.unpackb(
+            frames[0], strict_map_key=True, max_map_len=64, max_array_len=64, max_ext_len=0, use_list=True
+        )
+    except Exception:  # msgpack raises a dozen kinds, some of them bare ValueError or RecursionError
+        raise CodecError("malformed", "the first frame is no msgpack map within the limits") from None
+    if not isinstance(header, dict) or not all(isinstance(k, str) for k in header):
+        raise CodecError("malformed", "the first frame is no msgpack map with string keys")
+    return header
+
+
+def _message_class(header: dict[str, Any]) -> type[Message]:
+    version, name = header.pop("v", None), header.pop("type", None)
+    if type(version) is not int or version != PROTOCOL:
+        raise CodecError("version", f"protocol version {str(version)[:20]!r} is foreign: use version {PROTOCOL}")
+    if not isinstance(name, str) or name not in _TYPES:
+        raise CodecError("unknown", f"there is no message type {str(name)[:40]!r}")
+    return _TYPES[name]
+
+
+def _frame(rest: Any, name: str, shape: Any, rule: fields.Rule) -> Any:
+    data = next(rest, None)
+    if data is None:
+        raise CodecError("malformed", f"the frame of {name} is missing")
+    if rule.kind == "bytes":
+        return bytes(data)
+    dtype = np.dtype(rule.dtype)
+    if (
+        not isinstance(shape, list)
+        or len(shape) != rule.ndim
+        or not all(type(n) is int and 0 <= n < 2**31 for n in shape)
+    ):
+        raise CodecError("malformed", f"the shape of {name} must be {rule.ndim} ints")
+    count = 1
+    for n in shape:
+        count *= n
+    if count * dtype.itemsize != len(memoryview(data).cast("B")):
+        raise CodecError("malformed", f"the frame of {name} does not have the size of its shape")
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _array(raw: Any, name: str, rule: fields.Rule) -> Any:
+    dtype = np.dtype(rule.dtype)
+    if not isinstance(raw, bytes) or len(raw) % dtype.itemsize:
+        raise CodecError("malformed", f"{name} must be bytes of {rule.dtype} entries")
+    return np.frombuffer(raw, dtype)

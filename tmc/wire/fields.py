@@ -1,0 +1,128 @@
+"""Rules for message fields: kind, range and size, kept beside each field and checked whenever a message is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+class FieldError(ValueError):
+    """A field breaks its rule; `code` is the code of the error reply."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a field may hold. `kind`: int, float, str, bytes, array (1-D, in the header) or tensor (its own frame)."""
+
+    kind: str
+    low: float = 0.0
+    high: float = 0.0
+    choices: tuple[str, ...] = ()
+    dtype: str = ""
+    ndim: int = 1
+
+
+def _field(rule: Rule, default: Any = dataclasses.MISSING) -> Any:
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata={"rule": rule})
+    return dataclasses.field(default=default, metadata={"rule": rule})
+
+
+def integer(low: int, high: int, default: Any = dataclasses.MISSING) -> Any:
+    """An int, never a bool, in low..high."""
+    return _field(Rule("int", low, high), default)
+
+
+def real(low: float, high: float) -> Any:
+    """A finite float in low..high."""
+    return _field(Rule("float", low, high))
+
+
+def choice(*names: str) -> Any:
+    """One of these strings."""
+    return _field(Rule("str", 0, 64, choices=names))
+
+
+def text(longest: int) -> Any:
+    """A string of at most `longest` characters."""
+    return _field(Rule("str", 0, longest))
+
+
+def blob(longest: int) -> Any:
+    """Bytes in a frame of their own."""
+    return _field(Rule("bytes", 0, longest))
+
+
+def array(dtype: str, longest: int) -> Any:
+    """A short one-dimensional array, carried in the header as little-endian bytes; finite if it holds floats."""
+    return _field(Rule("array", 0, longest, dtype=dtype))
+
+
+def tensor(dtype: str, ndim: int) -> Any:
+    """A large array in a frame of its own, so that neither side copies it."""
+    return _field(Rule("tensor", 0, 2**28, dtype=dtype, ndim=ndim))
+
+
+def rules(cls: type) -> dict[str, Rule]:
+    """The rule of each field of a message class, in order."""
+    cached: dict[str, Rule] | None = cls.__dict__.get("_rules")
+    if cached is None:
+        cached = {f.name: f.metadata["rule"] for f in dataclasses.fields(cls)}
+        cls._rules = cached  # type: ignore[attr-defined]
+    return cached
+
+
+def check(message: Any) -> None:
+    """Raise FieldError at the first field that breaks its rule."""
+    for name, rule in rules(type(message)).items():
+        problem = _problem(getattr(message, name), rule)
+        if problem:
+            code = "range" if problem.startswith("is out of") else "malformed"
+            raise FieldError(code, f"{type(message).__name__}.{name} {problem}")
+
+
+def _problem(value: Any, rule: Rule) -> str:
+    return _CHECKS[rule.kind](value, rule)
+
+
+def _int(value: Any, rule: Rule) -> str:
+    if type(value) is not int:
+        return f"must be an int, not {type(value).__name__}"
+    return "" if rule.low <= value <= rule.high else f"is out of range: {value} is not in {rule.low}..{rule.high}"
+
+
+def _float(value: Any, rule: Rule) -> str:
+    if type(value) is not float or not math.isfinite(value):
+        return "must be a finite float"
+    return "" if rule.low <= value <= rule.high else f"is out of range: {value} is not in {rule.low:g}..{rule.high:g}"
+
+
+def _str(value: Any, rule: Rule) -> str:
+    if type(value) is not str or len(value) > rule.high:
+        return f"must be a string of at most {int(rule.high)} characters"
+    return "" if not rule.choices or value in rule.choices else f"must be one of {', '.join(rule.choices)}"
+
+
+def _bytes(value: Any, rule: Rule) -> str:
+    return "" if isinstance(value, bytes) and len(value) <= rule.high else f"must be at most {int(rule.high)} bytes"
+
+
+def _array(value: Any, rule: Rule) -> str:
+    if not isinstance(value, np.ndarray) or value.dtype != np.dtype(rule.dtype) or value.ndim != rule.ndim:
+        return f"must be an array of {rule.dtype} with {rule.ndim} dimension(s)"
+    if value.size > rule.high:
+        return f"is out of range: {value.size} entries, at most {int(rule.high)}"
+    if value.dtype.kind == "f" and not np.isfinite(value).all():
+        return "is out of range: it holds a value that is not finite"
+    return ""
+
+
+_CHECKS = {"int": _int, "float": _float, "str": _str, "bytes": _bytes, "array": _array, "tensor": _array}

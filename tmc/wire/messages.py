@@ -1,0 +1,236 @@
+"""Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is sound.
+
+`docs/protocol.md` is the text to this table. Who sends what: UAV -> TMC: Hello, Record, PolicyRequest, Bye.
+TMC -> UAV: Welcome, Begin, Map, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
+TMC -> learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status.
+UAV -> UAV, passed on by the TMC where the two share no memory: Beacon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.wire import fields as f
+
+PROTOCOL = 1
+"""Version of the protocol: a frame of any other version is refused."""
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Message:
+    """Base of all messages; checks every field against its rule."""
+
+    def __post_init__(self) -> None:
+        f.check(self)
+
+
+@dataclass(frozen=True)
+class Hello(Message):
+    """First word of a client. `uav` is -1 unless the role is "uav"; `life` is new each time a process starts."""
+
+    role: str = f.choice("uav", "learner")
+    uav: int = f.integer(-1, 65_535)
+    life: int = f.integer(0, 2**63 - 1)
+    updates: int = f.integer(0, 2**62, default=0)
+
+
+@dataclass(frozen=True)
+class Welcome(Message):
+    """The mission that the TMC runs: all settings, the map's fingerprint, and the number of the run."""
+
+    config: str = f.text(65_536)
+    map: str = f.text(64)
+    run: str = f.text(64)
+    tracks: str = f.text(4096)
+
+
+@dataclass(frozen=True)
+class Begin(Message):
+    """Fly from here: a new episode (`shipped` = -1, tick 0), or the flight of a lost process taken up again.
+
+    `last_visit` (u16, one a monitored cell) and `visited` (u16, cells of own visits) are the UAV's knowledge at `tick`.
+    """
+
+    episode: int = f.integer(1, 2**31 - 1)
+    tick: int = f.integer(0, 65_535)
+    cell: int = f.integer(0, 65_535)
+    shipped: int = f.integer(-1, 65_535)
+    sequence: int = f.integer(0, 2**62)
+    version: int = f.integer(0, 2**62)
+    policy: int = f.integer(0, 2**62)
+    last_visit: Array = f.array("<u2", 65_535)
+    visited: Array = f.array("<u2", 65_535)
+    active: Array = f.array("<u2", 65_535)
+
+
+@dataclass(frozen=True)
+class Record(Message):
+    """A flight record: what UAV `uav` did in ticks `first`..`tick` of an episode.
+
+    `cells` has one entry a tick. `actions`, `blocks` (why a move was blocked, 0: it was not) and `rewards` (as the UAV
+    reckons them by its own map) have one entry a move, so one less than `cells` when the record starts at tick 0.
+    `seen_tick`, `seen_cell`: peers sensed, one entry a sighting. `version`: the map that the UAV flew by.
+    """
+
+    uav: int = f.integer(0, 65_535)
+    life: int = f.integer(0, 2**63 - 1)
+    sequence: int = f.integer(0, 2**62)
+    episode: int = f.integer(1, 2**31 - 1)
+    first: int = f.integer(0, 65_535)
+    tick: int = f.integer(0, 65_535)
+    version: int = f.integer(0, 2**62)
+    policy: int = f.integer(0, 2**62)
+    cells: Array = f.array("<u2", 65_535)
+    actions: Array = f.array("u1", 65_535)
+    blocks: Array = f.array("u1", 65_535)
+    rewards: Array = f.array("<f4", 65_535)
+    seen_tick: Array = f.array("<u2", 1_000_000)
+    seen_cell: Array = f.array("<u2", 1_000_000)
+
+
+@dataclass(frozen=True)
+class Map(Message):
+    """The TMC's answer to a record: the global map with every visit due by `tick`, and what it has acknowledged.
+
+    `last_visit` (u16 ticks, one a monitored cell) in scenario II; `active` (u16 cells with an event) in scenario I.
+    """
+
+    episode: int = f.integer(1, 2**31 - 1)
+    tick: int = f.integer(0, 65_535)
+    version: int = f.integer(0, 2**62)
+    policy: int = f.integer(0, 2**62)
+    sequence: int = f.integer(0, 2**62)
+    last_visit: Array = f.array("<u2", 65_535)
+    active: Array = f.array("<u2", 65_535)
+
+
+@dataclass(frozen=True)
+class PolicyRequest(Message):
+    """Send me the policy with this version."""
+
+    version: int = f.integer(0, 2**62)
+
+
+@dataclass(frozen=True)
+class Policy(Message):
+    """A policy file: `model` is an ONNX model that carries its own description."""
+
+    version: int = f.integer(0, 2**62)
+    model: bytes = f.blob(64 * 1024 * 1024)
+
+
+@dataclass(frozen=True)
+class SampleRequest(Message):
+    """One minibatch, please. `request` comes back in the answer."""
+
+    request: int = f.integer(0, 2**62)
+
+
+@dataclass(frozen=True)
+class Minibatch(Message):
+    """`b` transitions (o_t, a_t, o_{t+n}, r) with their observations rebuilt.
+
+    `observation`, `next_observation`: (b, C, H, W) float32. `reward`: the n-step sum, unscaled. `discount`: gamma^n.
+    `allowed`: (b, 9), 0 for the actions that a UAV in o_{t+n} would not choose. `episodes`: finished so far.
+    """
+
+    request: int = f.integer(0, 2**62)
+    episodes: int = f.integer(0, 2**31 - 1)
+    ticks: int = f.integer(0, 2**62)
+    observation: Array = f.tensor("<f4", 4)
+    action: Array = f.tensor("u1", 1)
+    reward: Array = f.tensor("<f4", 1)
+    next_observation: Array = f.tensor("<f4", 4)
+    discount: Array = f.tensor("<f4", 1)
+    allowed: Array = f.tensor("u1", 2)
+
+
+@dataclass(frozen=True)
+class PolicyPush(Message):
+    """The learner's policy after `updates` updates; a version that is not newer is refused."""
+
+    version: int = f.integer(1, 2**62)
+    updates: int = f.integer(0, 2**62)
+    loss: float = f.real(-1e30, 1e30)
+    model: bytes = f.blob(64 * 1024 * 1024)
+
+
+@dataclass(frozen=True)
+class Ack(Message):
+    """The TMC has it."""
+
+    version: int = f.integer(0, 2**62)
+
+
+@dataclass(frozen=True)
+class Beacon(Message):
+    """UAV `uav` stood on `cell` at `tick`. With `ask` 1: and please tell me your own track from `tick` on."""
+
+    uav: int = f.integer(0, 65_535)
+    episode: int = f.integer(1, 2**31 - 1)
+    tick: int = f.integer(0, 65_535)
+    cells: Array = f.array("<u2", 65_535)
+    ask: int = f.integer(-1, 65_535, default=-1)
+
+
+@dataclass(frozen=True)
+class StatusRequest(Message):
+    """How far is the mission?"""
+
+
+@dataclass(frozen=True)
+class Status(Message):
+    """Progress of the mission. `phase`: gathering, flying, learning (the learner catches up) or done."""
+
+    phase: str = f.choice("gathering", "flying", "learning", "done")
+    episode: int = f.integer(0, 2**31 - 1)
+    tick: int = f.integer(0, 65_535)
+    ticks: int = f.integer(0, 2**62)
+    updates: int = f.integer(0, 2**62)
+    policy: int = f.integer(0, 2**62)
+    loss: float = f.real(-1e30, 1e30)
+    uncertainty: float = f.real(0.0, 1e9)
+    episode_uncertainty: float = f.real(0.0, 1e9)
+    blocked: int = f.integer(0, 2**62)
+    rejected: int = f.integer(0, 2**62)
+    waiting: str = f.text(1024)
+
+
+@dataclass(frozen=True)
+class End(Message):
+    """The mission is over; leave."""
+
+    reason: str = f.text(1024)
+
+
+@dataclass(frozen=True)
+class Bye(Message):
+    """A client leaves in order."""
+
+    role: str = f.choice("uav", "learner")
+    uav: int = f.integer(-1, 65_535)
+    reason: str = f.text(1024)
+
+
+@dataclass(frozen=True)
+class Error(Message):
+    """What was wrong with your frame, and the mend. Nothing was changed by it."""
+
+    code: str = f.choice("malformed", "version", "unknown", "range", "state", "fenced", "refused")
+    text: str = f.text(1024)
+
+
+MESSAGES: tuple[type[Message], ...] = (
+    Hello, Welcome, Begin, Record, Map, PolicyRequest, Policy, SampleRequest, Minibatch, PolicyPush, Ack, Beacon,
+    StatusRequest, Status, End, Bye, Error,
+)  # fmt: skip
+
+EMPTY: NDArray[np.uint16] = np.zeros(0, "<u2")
+
+__all__ = [m.__name__ for m in MESSAGES] + ["EMPTY", "MESSAGES", "PROTOCOL", "Array", "Message"]
