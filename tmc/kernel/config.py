@@ -1,4 +1,4 @@
-"""The one configuration: every setting with its default, unit and source. Files, options and log metadata derive from it.
+"""The one configuration: every setting with its default, unit and source. Files, options and log metadata follow.
 
 The defaults are the paper's (Table I and Sec. IV), so the preset `paper` changes nothing. A setting is named by its
 dotted key, such as `dqn.gamma`; `overfly run --set dqn.gamma=0.95` and the TOML presets use these same keys.
@@ -48,6 +48,7 @@ class World:
 @dataclass(frozen=True)
 class Team:
     size: int = _s(3, "N, the number of UAVs", "UAVs", "Sec. IV-C")
+    pilot: str = _s("policy", "who flies: policy, or planner:random, planner:random-road, planner:greedy")
     sensing_range: float = _s(1.5, "r_s in scenario II", "cell widths d", "Sec. IV-B")
 
 

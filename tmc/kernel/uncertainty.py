@@ -5,8 +5,8 @@ Scenario II keeps, for every cell, the tick of its last visit `tau_k` and comput
     u_k(t) = 1 - exp(-alpha_k (t - tau_k))                                         (eq. 3)
 
 An initial map that is not "all visited at t = 0" is carried by one factor a cell, `s_k = 1 - u_k(0)`, in force until
-the first visit: u_k(t) = 1 - s_k exp(-alpha_k t). Values come from a table of exp(-alpha n), so that every process, and the
-replay that rebuilds what a UAV saw, gets the same bits.
+the first visit: u_k(t) = 1 - s_k exp(-alpha_k t). Values come from a table of exp(-alpha n), so that
+every process, and the replay that rebuilds what a UAV saw, gets the same bits.
 """
 
 from __future__ import annotations
@@ -19,38 +19,39 @@ class UncertaintyLaw:
     """Eq. (3) for a fixed set of cells and rates; holds tables, no state.
 
     Arguments: `alpha`, shape (K,), events a tick in each cell (0 where nothing is monitored); `ticks`, the longest age
-    that is asked for; `initial`, shape (K,), u_k(0) before any visit, or None when all cells count as visited at t = 0.
+    that is asked for. All arrays are over the R monitored cells, in ascending order of k.
     """
 
-    def __init__(self, alpha: NDArray[np.float64], ticks: int, initial: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, alpha: NDArray[np.float64], ticks: int) -> None:
         self.cells = np.flatnonzero(alpha > 0).astype(np.int32)
-        """The monitored cells k, ascending; all arrays of this class are over these, `R` of them."""
-        self.index = np.full(alpha.size + 1, -1, np.int32)
-        """Shape (K + 1,): where cell k stands in `cells`, or -1."""
+        """Shape (R,): the monitored cells k."""
+        self.index = np.full(alpha.size, -1, np.int32)
+        """Shape (K,): where cell k stands in `cells`, or -1."""
         self.index[self.cells] = np.arange(self.cells.size)
-        rates, self._rate_of = np.unique(alpha[self.cells], return_inverse=True)
-        self._decay = np.exp(-rates[:, None] * np.arange(ticks + 1)[None, :])
-        self._flat = self._decay.ravel()
-        self._offset = (self._rate_of * (ticks + 1)).astype(np.int64)
+        self.index_list = [int(i) for i in self.index]
         self.q = np.exp(-alpha[self.cells])
         """Shape (R,): q_k = exp(-alpha_k), what is left of certainty after one tick."""
-        self._s = None if initial is None else 1.0 - initial[self.cells]
+        rates, rate_of = np.unique(alpha[self.cells], return_inverse=True)
+        self._decay = np.exp(-rates[:, None] * np.arange(ticks + 1)[None, :]).ravel()
+        self._offset = rate_of.astype(np.int64) * (ticks + 1)
 
-    def values(self, last_visit: NDArray[np.integer], t: int | NDArray[np.integer]) -> NDArray[np.float64]:
+    def values(
+        self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64], s: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """u_k(t) from the ticks of the last visits. Shapes (..., R) and () or (..., 1) -> (..., R), float64.
 
-        `last_visit` 0 means "not since the start": then the initial map is in force.
+        `s`, shape (..., R): the initial map's factors 1 - u_k(0), for cells with `last_visit` 0, "not since the start".
         """
-        left = self._flat[self._offset + (t - last_visit.astype(np.int64))]
-        if self._s is not None:
-            left = np.where(last_visit == 0, self._s * left, left)
+        left = self._decay[self._offset + (t - last_visit.astype(np.int64))]
+        if s is not None:
+            left = np.where(last_visit == 0, s * left, left)
         return np.asarray(1.0 - left)
 
-    def value(self, i: int, last_visit: int, t: int) -> float:
-        """u of the one monitored cell with index `i` in `cells`; the same bits as `values`."""
-        left = float(self._flat[self._offset[i] + t - last_visit])
-        if self._s is not None and last_visit == 0:
-            left *= float(self._s[i])
+    def value(self, i: int, last_visit: int, t: int, s: NDArray[np.float64] | None = None) -> float:
+        """u of the one cell `cells[i]`; the same bits as `values`."""
+        left = float(self._decay[self._offset[i] + t - last_visit])
+        if s is not None and last_visit == 0:
+            left = float(s[i]) * left
         return 1.0 - left
 
 

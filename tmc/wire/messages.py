@@ -170,12 +170,16 @@ class Ack(Message):
 
 @dataclass(frozen=True)
 class Beacon(Message):
-    """UAV `uav` stood on `cell` at `tick`. With `ask` 1: and please tell me your own track from `tick` on."""
+    """UAV `uav` stood on `cells` at `tick` and the ticks after it; the TMC passes it on to the UAVs in `to`.
+
+    `ask` >= 0: and please tell me your own track from tick `ask` on.
+    """
 
     uav: int = f.integer(0, 65_535)
     episode: int = f.integer(1, 2**31 - 1)
     tick: int = f.integer(0, 65_535)
     cells: Array = f.array("<u2", 65_535)
+    to: Array = f.array("<u2", 65_535)
     ask: int = f.integer(-1, 65_535, default=-1)
 
 

@@ -1,0 +1,222 @@
+"""One UAV as a core without I/O: it senses, ships its record when due, decides, moves, and says what it must wait for.
+
+Per tick t, in this order (DESIGN section 2): sense the peers near it and update the own map; at t mod T_u = phase ship
+the record and merge the TMC's map; observe o(t) and choose a(t); move, unless the target is held; the new cell is
+visited at t + 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.airspace import Airspace, Tracks
+from actors.planners import Decider, Sight
+from tmc.kernel.grid import N_ACTIONS, OFF_GRID
+from tmc.kernel.observation import Observer
+from tmc.kernel.reward import Block, RewardLaw
+from tmc.kernel.uncertainty import merge
+from tmc.kernel.world import World
+from tmc.wire.messages import EMPTY, Begin, Map, Policy, PolicyRequest, Record
+
+
+class Phase(Enum):
+    """What the pilot does next, or waits for."""
+
+    IDLE = "waits for an episode"
+    POLICY = "waits for a policy"
+    SENSE = "senses its peers"
+    MAP = "waits for the TMC's map"
+    ACT = "decides"
+    MOVE = "moves"
+
+
+@dataclass
+class Leg:
+    """What was flown since the last record."""
+
+    first: int
+    cells: list[int] = field(default_factory=list)
+    actions: list[int] = field(default_factory=list)
+    blocks: list[int] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    seen: list[tuple[int, int]] = field(default_factory=list)
+
+
+class Pilot:
+    """UAV `uav` of a world. `make_decider` turns the bytes of a policy file into a Decider; a planner needs none."""
+
+    def __init__(
+        self,
+        world: World,
+        uav: int,
+        life: int,
+        tracks: Tracks,
+        observer: Observer,
+        make_decider: Callable[[bytes], Decider],
+        planner: Decider | None = None,
+    ) -> None:
+        self.world, self.uav, self.life, self.observer = world, uav, life, observer
+        self.config, self.law = world.config, world.law
+        self.airspace = Airspace(uav, self.config.team.size, world.grid, observer.sensing, tracks)
+        self.reward = RewardLaw(self.config, world.law.q)
+        self.decider, self._make_decider, self._planner = planner, make_decider, planner
+        self.phase = Phase.IDLE
+        self.episode = self.t = self.cell = self.sequence = self.version = 0
+        self.policy = self._wanted = 0
+        self.explored = self.steps = 0
+        self.pending: Record | None = None
+
+    # Messages in.
+
+    def begin(self, begin: Begin) -> PolicyRequest | None:
+        """Start an episode, or take a flight up again where the TMC's last record of it ends."""
+        if self.phase is not Phase.IDLE and begin.episode == self.episode:
+            return None  # a repeat
+        self.episode, self.t, self.cell = begin.episode, begin.tick, begin.cell
+        self.sequence, self.version = begin.sequence, begin.version
+        self.airspace.begin(self.episode, self.world.starts(self.episode))
+        self._epsilon = self.config.epsilon(self.episode)
+        self._draws = self.world.explorations(self.episode, self.uav)
+        self._factor = self.world.initial_factor(self.episode)
+        self.last_visit = begin.last_visit.copy()
+        self.active = np.zeros(self.world.grid.size, bool)
+        self.visited = set(begin.visited.tolist())
+        self.shipped = begin.shipped
+        self.leg = Leg(begin.shipped + 1)
+        self.pending = None
+        if begin.shipped < 0:
+            self.leg.cells.append(self.cell)
+        self.airspace.tracks.publish(self.t, self.cell)
+        return self._want(begin.policy, Phase.SENSE)
+
+    def on_map(self, answer: Map) -> PolicyRequest | None:
+        """The TMC's answer to the record of tick t; anything else is old news and dropped."""
+        if self.phase is not Phase.MAP or (answer.episode, answer.tick) != (self.episode, self.t):
+            return None
+        if self.config.scenario == 1:
+            self.active[:] = False
+            self.active[answer.active] = True
+        else:
+            self.last_visit = merge(self.last_visit, answer.last_visit)
+        self.version, self.pending = answer.version, None
+        return self._want(answer.policy, Phase.ACT)
+
+    def _want(self, version: int, then: Phase) -> PolicyRequest | None:
+        """A policy reaches a UAV only at an exchange: ask for the one that the TMC names, if it is another."""
+        self.phase = then
+        if self._planner is not None or version == self.policy:
+            return None
+        self.phase, self._then, self._wanted = Phase.POLICY, then, version
+        return PolicyRequest(version)
+
+    def on_policy(self, policy: Policy) -> None:
+        """The policy that was asked for. Raises PolicyError when it cannot fly here."""
+        if self.phase is Phase.POLICY and policy.version >= self._wanted:
+            self.decider = self._make_decider(policy.model)
+            self.policy, self.phase = policy.version, self._then
+
+    # Flying.
+
+    def advance(self) -> Record | None:
+        """Fly until a record must go out (returned), or a message is needed (None); raises Waiting for a peer."""
+        while True:
+            if self.phase is Phase.SENSE:
+                if self._sense():
+                    return self._ship()
+            elif self.phase is Phase.ACT:
+                self._act()
+            elif self.phase is Phase.MOVE:
+                self._move()
+            else:
+                return None
+
+    def _sense(self) -> bool:
+        """Sense at t and make the local update (Sec. II-D): own cell and cells of sensed peers get tau = t.
+
+        Returns whether a record must go out now.
+        """
+        self.peers = self.airspace.sense(self.t, self.cell)
+        index = self.law.index_list
+        for cell in (self.cell, *self.peers):
+            if index[cell] >= 0:
+                self.last_visit[index[cell]] = self.t
+        due, fresh = self.config.due(self.uav, self.t), self.t > self.shipped
+        if fresh:  # a flight taken up again stands at a tick that the TMC has
+            self.leg.seen.extend((self.t, cell) for cell in self.peers)
+        self.phase = Phase.MAP if due else Phase.ACT
+        return due and fresh
+
+    def _ship(self) -> Record:
+        leg = self.leg
+        seen = np.array(leg.seen, "<u2").reshape(-1, 2) if leg.seen else None
+        self.pending = Record(
+            self.uav, self.life, self.sequence, self.episode, leg.first, self.t, self.version, self.policy,
+            np.array(leg.cells, "<u2"), np.array(leg.actions, "u1"), np.array(leg.blocks, "u1"),
+            np.array(leg.rewards, "<f4"),
+            EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
+        )  # fmt: skip
+        self.sequence += 1
+        self.shipped = self.t
+        self.leg = Leg(self.t + 1)
+        return self.pending
+
+    def map_of(self, t: int) -> NDArray[np.float64]:
+        """The UAV's own uncertainty map U_i(t), shape (R,)."""
+        if self.config.scenario == 1:
+            return self.active[self.law.cells].astype(np.float64)
+        return self.law.values(self.last_visit, t, self._factor)
+
+    def sight(self) -> Sight:
+        """What this UAV knows at t."""
+        allowed = self.observer.allowed(self.cell, self.peers)
+        return Sight(self.t, self.cell, self.peers, self.map_of(self.t), allowed, float(self._draws[self.t, 1]))
+
+    def _act(self) -> None:
+        """Choose a(t), epsilon-greedy; at the end of the episode there is nothing left to do."""
+        if self.t == self.config.training.ticks:
+            self.phase = Phase.IDLE
+            return
+        explore, draw = self._draws[self.t]
+        if self._planner is None and explore < self._epsilon:
+            self.explored += 1
+            mask = self.config.exploration.mask_blocked
+            choices = self.observer.allowed(self.cell, self.peers) if mask else range(N_ACTIONS)
+            self.action = choices[int(draw * len(choices))]
+        else:
+            assert self.decider is not None
+            self.action = self.decider.choose(self.sight())
+        self.phase = Phase.MOVE
+
+    def _move(self) -> None:
+        target = self.world.grid.target_lists[self.cell][self.action]
+        block = self._block(target)
+        cell = self.cell if block else target
+        k = self.law.index_list[cell]
+        u = self._before_visit(k, cell) if k >= 0 else 0.0
+        self.leg.rewards.append(self.reward(bool(block), cell not in self.visited, k, u))
+        self.visited.add(cell)
+        self.t, self.cell = self.t + 1, cell
+        self.airspace.tracks.publish(self.t, cell)
+        self.leg.cells.append(cell)
+        self.leg.actions.append(self.action)
+        self.leg.blocks.append(block)
+        self.steps += 1
+        self.phase = Phase.SENSE
+
+    def _block(self, target: int) -> Block:
+        if target == OFF_GRID:
+            return Block.GRID
+        if self.world.map.blocked[target]:
+            return Block.OBSTACLE
+        return Block.UAV if self.airspace.held(self.t, self.cell, target) else Block.NONE
+
+    def _before_visit(self, k: int, cell: int) -> float:
+        """r^u by the UAV's own map: the uncertainty at t + 1 just before the visit resets it."""
+        if self.config.scenario == 1:
+            return float(self.active[cell])
+        return self.law.value(k, int(self.last_visit[k]), self.t + 1, self._factor)

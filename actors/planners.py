@@ -1,0 +1,78 @@
+"""Classical planners, the baselines that a learned policy must beat. Each decides by what one UAV knows, no more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.kernel.grid import N_ACTIONS, STAY
+from tmc.kernel.world import World
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a UAV knows when it decides: its cell, the cells of sensed peers, its map `u` (R,), the moves that nothing
+    known blocks, and one draw in [0, 1) of its own."""
+
+    tick: int
+    cell: int
+    peers: list[int]
+    u: NDArray[np.float64]
+    allowed: list[int]
+    draw: float
+
+
+class Decider(Protocol):
+    """A policy or a planner: chooses an action id."""
+
+    def choose(self, sight: Sight) -> int: ...
+
+
+Planner = Callable[[World, Sight], int]
+
+
+def pick(choices: list[int], draw: float) -> int:
+    """One of the choices, each equally likely."""
+    return choices[int(draw * len(choices))]
+
+
+def random(_world: World, sight: Sight) -> int:
+    """Any of the nine actions, blocked or not: what exploration alone does."""
+    return pick(list(range(N_ACTIONS)), sight.draw)
+
+
+def random_road(world: World, sight: Sight) -> int:
+    """A random move along the road; off the road, a move that brings the UAV nearer to it."""
+    return _nearest_to_road(world, sight, [a for a in sight.allowed if a != STAY] or [STAY])
+
+
+def greedy(world: World, sight: Sight) -> int:
+    """The best of the nine cells by the UAV's own map; ties go to the cell nearest to the road, then to the draw."""
+    index, targets = world.law.index_list, world.grid.target_lists[sight.cell]
+    u = [float(sight.u[index[targets[a]]]) if index[targets[a]] >= 0 else 0.0 for a in sight.allowed]
+    best = max(u)
+    return _nearest_to_road(world, sight, [a for a, value in zip(sight.allowed, u, strict=True) if value == best])
+
+
+def _nearest_to_road(world: World, sight: Sight, choices: list[int]) -> int:
+    distance, targets = world.map.road_distance, world.grid.target_lists[sight.cell]
+    away = [int(distance[targets[a]]) for a in choices]
+    return pick([a for a, d in zip(choices, away, strict=True) if d == min(away)], sight.draw)
+
+
+PLANNERS: dict[str, Planner] = {"random": random, "random-road": random_road, "greedy": greedy}
+PREFIX = "planner:"
+
+
+class PlannerDecider:
+    """A planner in a world, as a Decider."""
+
+    def __init__(self, world: World, name: str) -> None:
+        self._world, self._planner = world, PLANNERS[name.removeprefix(PREFIX)]
+
+    def choose(self, sight: Sight) -> int:
+        return self._planner(self._world, sight)

@@ -1,0 +1,163 @@
+"""Checkpoints: all state of a trainer in one safetensors file, which is there whole or not at all.
+
+A file is written under another name, synced, and then renamed; its own metadata hold the counters, the settings and a
+digest of everything. Nothing in it is ever executed, as unpickling would.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_safetensors
+from torch import Tensor
+
+from learner.trainer import State, Trainer, layout
+from tmc.kernel.config import flat
+
+FORMAT = 1
+KEEP = 3
+KEY, DIGEST = "overfly", "digest"
+"""Entries of the file's metadata: all of `Meta` as JSON, and the SHA-256 of that and of the tensors."""
+PREFIX, SUFFIX, PART = "checkpoint-", ".safetensors", ".part"
+NETWORK = (
+    "network.channels",
+    "network.kernel",
+    "network.stride",
+    "network.dense",
+    "observation.view",
+    "observation.near",
+)
+"""Settings in which a checkpoint and a mission must agree; the shape of the view is compared as well."""
+
+log = logging.getLogger(__name__)
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is damaged or was made for something else: one sentence with the mend."""
+
+
+@dataclass(frozen=True)
+class Meta:
+    """What a checkpoint says of itself. `shape`: of an observation; `config`: all settings, by dotted key."""
+
+    format: int
+    updates: int
+    version: int
+    copied: int
+    shape: list[int]
+    config: dict[str, Any]
+
+
+def save(folder: Path, trainer: Trainer) -> Path:
+    """Write `checkpoint-<updates>.safetensors` in one step; keep it and the two before it. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    state = trainer.state()
+    meta = Meta(FORMAT, state.updates, state.version, state.copied, list(trainer.shape), flat(trainer.config))
+    text = json.dumps(vars(meta), sort_keys=True)
+    path = folder / f"{PREFIX}{state.updates}{SUFFIX}"
+    _write(path, to_safetensors(state.tensors, {KEY: text, DIGEST: digest(text, state.tensors)}))
+    _prune(folder, state.updates)
+    return path
+
+
+def _write(path: Path, data: bytes) -> None:
+    """The file is there with all its bytes, or as it was before, whenever the power goes."""
+    part = path.with_name(path.name + PART)
+    with part.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)  # the new name itself is on the disk only then
+    finally:
+        os.close(directory)
+
+
+def _prune(folder: Path, updates: int) -> None:
+    """Drop what a killed writer left, and all but the newest KEEP up to `updates`.
+
+    Files of later updates are damaged, or of a line that the user has left: they are not ours to delete.
+    """
+    old = [path for n, path in _numbered(folder) if n <= updates][KEEP:]
+    for path in [*old, *folder.glob(f"{PREFIX}*{SUFFIX}{PART}")]:
+        path.unlink(missing_ok=True)
+
+
+def _numbered(folder: Path) -> list[tuple[int, Path]]:
+    """(updates, path) of every checkpoint in the folder, the newest first."""
+    names = ((path.name[len(PREFIX) : -len(SUFFIX)], path) for path in folder.glob(f"{PREFIX}*{SUFFIX}"))
+    return sorted(((int(n), path) for n, path in names if n.isdecimal()), reverse=True)
+
+
+def newest(folder: Path) -> Path | None:
+    """The checkpoint with the most updates that can be read, or None; each damaged one is skipped with a warning."""
+    for _, path in _numbered(folder):
+        try:
+            read(path)
+        except CheckpointError as error:
+            log.warning("skipped: %s", error)
+        else:
+            return path
+    return None
+
+
+def read(path: Path) -> tuple[Meta, State]:
+    """What a checkpoint holds. Raises CheckpointError for one that is damaged or of a foreign format."""
+    damaged = f"the checkpoint {path.name} is damaged or cut short: delete it to go on from an older one"
+    try:
+        with safe_open(path, framework="pt") as file:
+            notes = file.metadata() or {}
+            tensors: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        text = notes[KEY]
+        known = json.loads(text)["format"]
+    except FileNotFoundError:
+        raise CheckpointError(f"there is no checkpoint {path}: choose one that is in its folder") from None
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError):
+        raise CheckpointError(damaged) from None
+    if known != FORMAT:
+        raise CheckpointError(f"the checkpoint {path.name} has format {known}, this Overfly reads format {FORMAT}")
+    if notes.get(DIGEST) != digest(text, tensors):
+        raise CheckpointError(damaged)
+    meta = Meta(**json.loads(text))
+    return meta, State(tensors, meta.updates, meta.version, meta.copied)
+
+
+def load(path: Path, trainer: Trainer) -> None:
+    """Make the trainer go on from a checkpoint. Raises CheckpointError, and leaves the trainer as it was."""
+    meta, state = read(path)
+    difference = _difference(meta, trainer)
+    if difference:
+        raise CheckpointError(f"the checkpoint {path.name} {difference}: choose the settings it was made with")
+    if layout(state.tensors) != layout(trainer.state().tensors):
+        raise CheckpointError(f"the checkpoint {path.name} has other weights than the network: start without it")
+    trainer.load(state)
+
+
+def _difference(meta: Meta, trainer: Trainer) -> str:
+    """In what the checkpoint's network differs from the trainer's, "" when in nothing."""
+    if tuple(meta.shape) != trainer.shape:
+        return f"was made for observations of shape {tuple(meta.shape)}, this mission has {trainer.shape}"
+    mine = flat(trainer.config)
+    for key in NETWORK:
+        was = meta.config.get(key)
+        if was != mine[key]:
+            return f"was made with {key} = {was}, this mission has {mine[key]}"
+    return ""
+
+
+def digest(text: str, tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over the metadata and all tensors, in the order of their names: a single flipped bit shows."""
+    total = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        total.update(name.encode())
+        total.update(tensors[name].numpy().tobytes())
+    return total.hexdigest()

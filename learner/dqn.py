@@ -1,0 +1,47 @@
+"""The equations of deep Q-learning, eqs. (12) and (13), as pure functions of tensors.
+
+B is the size of the minibatch; all values and rewards are in scaled reward, the unit that the network speaks.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import huber_loss
+
+
+def target(reward: Tensor, discount: Tensor, q_next: Tensor, allowed: Tensor, q_choice: Tensor | None = None) -> Tensor:
+    """Eq. (12): y = r + gamma^n max_a' Q(o', a'; theta-). Shape (B,), no gradient.
+
+    `reward` (B,): r_{t+1} + gamma r_{t+2} + ... of n ticks, `discount` (B,): gamma^n; the paper has n = 1.
+    `q_next` (B, 9): Q(o_{t+n}, . ; theta-). `allowed` (B, 9): zero for the actions that the max leaves out.
+    With `q_choice` (B, 9) = Q(o_{t+n}, . ; theta), a' is the best by that instead: double Q-learning, not in the paper.
+
+    There is no terminal term: an episode ends by a time limit, which is no state of the world, so y always bootstraps.
+    """
+    best = permitted(q_next if q_choice is None else q_choice, allowed).argmax(dim=1)
+    return (reward + discount * of(q_next, best)).detach()
+
+
+def permitted(q: Tensor, allowed: Tensor) -> Tensor:
+    """`q` with minus infinity where `allowed` is zero, so that no maximum falls there. Shape (B, 9)."""
+    return q.masked_fill(allowed == 0, -torch.inf)
+
+
+def of(q: Tensor, action: Tensor) -> Tensor:
+    """Q(o, a): the value of each row's own action. `q` (B, 9), `action` (B,) int64; shape (B,)."""
+    return q.gather(1, action.unsqueeze(1)).squeeze(1)
+
+
+def td_error(q: Tensor, action: Tensor, y: Tensor) -> Tensor:
+    """Q(o_t, a_t; theta) - y_t, the error inside eq. (13). Shape (B,)."""
+    return of(q, action) - y
+
+
+def loss(td: Tensor, kind: Literal["mse", "huber"] = "mse") -> Tensor:
+    """Eq. (13): the mean squared error over the minibatch; or (ours) Huber: td^2 / 2, linear beyond |td| = 1."""
+    if kind == "huber":
+        return huber_loss(td, torch.zeros_like(td), delta=1.0)
+    return td.square().mean()

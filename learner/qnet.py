@@ -1,0 +1,104 @@
+"""The Q-network Q(o, a; theta) of Fig. 2(b) and Table I: convolutions, one fully connected layer, nine values."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tmc.kernel import draws
+from tmc.kernel.config import Config, ConfigError, Network
+from tmc.kernel.draws import Stream
+from tmc.kernel.grid import N_ACTIONS
+
+Shape = tuple[int, int, int]
+"""(channels, height, width) of an observation, eq. (10)."""
+
+
+class QNet(nn.Module):
+    """Maps observations (B, C, H, W) float32 to the values of the nine actions (B, 9) float32, in scaled reward.
+
+    Sec. IV-B: ReLU after each convolution and after the dense layer, none after the last. With `near` > 0 (ours, off in
+    the paper's preset) the (2 near + 1)^2 cells in the middle, all channels, also go to the dense layer directly: with
+    a stride, the convolutions alone would blur which of the cells next to the UAV is which.
+    """
+
+    def __init__(self, network: Network, shape: Shape, near: int) -> None:
+        super().__init__()
+        channels, height, width = shape
+        self.shape, self.near, self.stride = shape, near, network.stride
+        filters = (channels, *network.channels)
+        self.convs = nn.ModuleList(nn.Conv2d(a, b, network.kernel, network.stride) for a, b in pairwise(filters))
+        rows, cols = features(network, height, width)
+        self.dense = nn.Linear(filters[-1] * rows * cols + channels * crop_size(near), network.dense)
+        self.out = nn.Linear(network.dense, N_ACTIONS)
+
+    def forward(self, o: Tensor) -> Tensor:
+        x = o
+        for conv in self.convs:
+            x = torch.relu(conv(x))
+        x = x.flatten(1)
+        if self.near:
+            x = torch.cat((x, self.crop(o).flatten(1)), dim=1)
+        values: Tensor = self.out(torch.relu(self.dense(x)))
+        return values
+
+    def crop(self, o: Tensor) -> Tensor:
+        """The middle of the observation: (B, C, 2 near + 1, 2 near + 1)."""
+        (top, bottom), (left, right) = (middle(side, self.near) for side in self.shape[1:])
+        return o[:, :, top:bottom, left:right]
+
+
+def middle(side: int, near: int) -> tuple[int, int]:
+    """First and one past the last of the 2 near + 1 cells in the middle of `side` cells."""
+    return side // 2 - near, side // 2 + near + 1
+
+
+def crop_size(near: int) -> int:
+    """Cells of the crop, 0 when it is off."""
+    return (2 * near + 1) ** 2 if near else 0
+
+
+def features(network: Network, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns after the last convolution (no padding); raises ConfigError when nothing would be left."""
+    rows, cols = height, width
+    for _ in network.channels:
+        if min(rows, cols) < network.kernel:
+            raise ConfigError(
+                f"a view of {height} x {width} cells is too small for {len(network.channels)} convolutions with "
+                f"network.kernel = {network.kernel} and network.stride = {network.stride}: lower these, "
+                "or raise observation.radius"
+            )
+        rows, cols = ((n - network.kernel) // network.stride + 1 for n in (rows, cols))
+    return rows, cols
+
+
+def build(config: Config, shape: Shape) -> QNet:
+    """The network for observations of this shape, with the initial weights of config.training.seed.
+
+    Same seed, same weights, on any machine and torch version. Raises ConfigError for a view too small for the network.
+    """
+    near = config.observation.near
+    if 2 * near + 1 > min(shape[1:]):
+        raise ConfigError(
+            f"observation.near = {near} is larger than the view: choose {(min(shape[1:]) - 1) // 2} or less"
+        )
+    with torch.device("meta"):  # makes no weights yet, so that torch's hidden global generator is left alone
+        net = QNet(config.network, shape, near)
+    net.to_empty(device="cpu")
+    initialise(net, config.training.seed)
+    return net
+
+
+@torch.no_grad()
+def initialise(net: QNet, seed: int) -> None:
+    """Weights and biases uniform in +-1 / sqrt(fan in), torch's own default, from addressed draws: one tick a layer."""
+    for i, layer in enumerate((*net.convs, net.dense, net.out)):
+        sizes = [p.numel() for p in layer.parameters()]
+        u = draws.uniforms(seed, Stream.WEIGHTS, sum(sizes), tick=i)
+        bound = 1.0 / math.sqrt(sizes[0] // sizes[1])  # weights per unit of the layer: the fan in
+        for p, part in zip(layer.parameters(), np.split(u, [sizes[0]]), strict=True):
+            p.copy_(torch.from_numpy((2.0 * part - 1.0) * bound).reshape(p.shape))

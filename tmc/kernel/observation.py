@@ -1,0 +1,104 @@
+"""The observation o_i(t) = [P_i(t), M, U_i(t)] (eq. 10), as a UAV builds it and as the replay rebuilds it, bit for bit.
+
+Channels: P, ego 1.0 and sensed peers 0.5; M, road 1, free 0, blocked or off the grid -1; U, the UAV's own map. The
+view is the whole grid, or the square of `2 radius + 1` cells around the UAV.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.kernel.grid import OFF_GRID, STAY
+from tmc.kernel.policy import view_shape
+from tmc.kernel.world import World
+
+EGO, PEER = 1.0, 0.5
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+class Observer:
+    """Builds observations of one world; holds tables, no state."""
+
+    def __init__(self, world: World) -> None:
+        config, grid = world.config, world.grid
+        self.grid = grid
+        self.shape = view_shape(config, grid)
+        self.sensing = np.inf if config.scenario == 1 else config.team.sensing_range
+        """r_s in cell widths; everyone knows all positions in scenario I (Sec. II-C)."""
+        self._whole = config.observation.view == "whole"
+        K, R = grid.size, world.law.cells.size
+        window = np.arange(K)[None, :] if self._whole else grid.window(config.observation.radius)
+        self._window = window.astype(np.int64)
+        terrain = np.where(world.map.blocked, -1.0, np.where(world.map.road, 1.0, 0.0))
+        self._terrain = np.append(terrain, -1.0).astype(np.float32)[self._window]
+        place = np.append(np.where(world.law.index < 0, R, world.law.index), R)
+        self._place = place[self._window].astype(np.int64)
+        targets = np.where(grid.targets == OFF_GRID, 0, grid.targets)
+        self.free = (grid.targets != OFF_GRID) & ~world.map.blocked[targets]
+        """Shape (K, 9): moves that neither the grid's edge nor an obstacle blocks."""
+        self._free_lists = [[a for a in range(STAY + 1) if row[a]] for row in self.free]
+        self._rows, self._cols = np.divmod(np.arange(K + 1), grid.cols)
+
+    def observe(self, cell: int, peers: list[int], u: NDArray[np.float64], out: Floats | None = None) -> Floats:
+        """o_i(t), shape (C, H, W), float32. `peers`: cells of the sensed UAVs; `u`: shape (R,), the UAV's own map."""
+        flat = np.empty((3, self._window.shape[1]), np.float32) if out is None else out.reshape(3, -1)
+        row = 0 if self._whole else cell
+        flat[1] = self._terrain[row]
+        flat[2] = np.append(u, 0.0)[self._place[row]]
+        flat[0] = 0.0
+        for peer in peers:
+            self._mark(flat[0], cell, peer, PEER)
+        self._mark(flat[0], cell, cell, EGO)
+        return flat.reshape(self.shape)
+
+    def _mark(self, plane: Floats, cell: int, where: int, value: float) -> None:
+        if self._whole:
+            plane[where] = value
+            return
+        (r0, c0), (r, c) = divmod(cell, self.grid.cols), divmod(where, self.grid.cols)
+        side = self.shape[1]
+        y, x = r - r0 + side // 2, c - c0 + side // 2
+        if 0 <= y < side and 0 <= x < side:
+            plane[y * side + x] = value
+
+    def allowed(self, cell: int, peers: list[int]) -> list[int]:
+        """Actions that nothing the UAV knows of blocks: grid, obstacles, and the cells of sensed peers. Never empty."""
+        targets = self.grid.target_lists[cell]
+        return [a for a in self._free_lists[cell] if targets[a] not in peers]
+
+    def sensed(self, cells: Ints, team: Ints, uav: Ints) -> NDArray[np.bool_]:
+        """N_i(t) for a batch: shapes (B,), (B, N), (B,) -> (B, N), True where the other UAV is within r_s."""
+        if np.isinf(self.sensing):
+            near = np.ones(team.shape, bool)
+        else:
+            dr = self._rows[team] - self._rows[cells][:, None]
+            dc = self._cols[team] - self._cols[cells][:, None]
+            near = dr * dr + dc * dc <= self.sensing * self.sensing + 1e-9
+        near[np.arange(len(uav)), uav] = False
+        return near
+
+    def observe_batch(self, cells: Ints, team: Ints, sensed: NDArray[np.bool_], u: NDArray[np.float64]) -> Floats:
+        """Observations of a batch: (B,), (B, N), (B, N), (B, R) -> (B, C, H, W), the same bits as `observe`."""
+        B, K = cells.size, self.grid.size
+        rows = np.zeros(B, np.int64) if self._whole else cells
+        out = np.empty((B, 3, self._window.shape[1]), np.float32)
+        plane = np.zeros((B, K + 2), np.float32)  # column K: off the grid; K + 1: where unseen peers go
+        batch = np.arange(B)
+        plane[batch[:, None], np.where(sensed, team, K + 1)] = PEER
+        plane[batch, cells] = EGO
+        out[:, 0] = plane[:, :K] if self._whole else np.take_along_axis(plane, self._window[cells], 1)
+        out[:, 1] = self._terrain[rows]
+        padded = np.zeros((B, u.shape[1] + 1), np.float32)
+        padded[:, :-1] = u
+        out[:, 2] = np.take_along_axis(padded, self._place[rows], 1)
+        return out.reshape(B, *self.shape)
+
+    def allowed_batch(self, cells: Ints, team: Ints, sensed: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """Shape (B, 9): 1 for the actions that `allowed` lists."""
+        targets = self.grid.targets[cells]
+        peers = np.where(sensed, team, -2)
+        held = (targets[:, :, None] == peers[:, None, :]).any(axis=2)
+        return np.asarray(self.free[cells] & ~held, np.uint8)

@@ -1,0 +1,38 @@
+"""The reward, eq. (11): r = r^c + r^n + lambda r^u, and why a move can be blocked."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.kernel.config import Config
+
+
+class Block(IntEnum):
+    """Why a UAV stayed although it wanted to move; a blocked UAV gets r^c and no other reward in that slot."""
+
+    NONE = 0
+    GRID = 1
+    OBSTACLE = 2
+    UAV = 3
+
+
+class RewardLaw:
+    """Eq. (11) with the settings `reward.*`; `q`, shape (R,), is exp(-alpha_k) of the monitored cells."""
+
+    def __init__(self, config: Config, q: NDArray[np.float64]) -> None:
+        reward = config.reward
+        self.collision = reward.collision
+        self.new_cell = reward.new_cell
+        # For uneven rates a visit is worth u_k / (1 - gamma q_k) to the team: the discounted sum of what it takes away.
+        scale = 1.0 / (1.0 - config.dqn.gamma * q) if reward.aligned else np.ones_like(q)
+        self._weight = [float(w) for w in reward.weight * scale]
+
+    def __call__(self, blocked: bool, novel: bool, index: int, u: float) -> float:
+        """r_{t+1}. `index`: the cell's place among the monitored ones, or -1; `u`: its uncertainty before the visit."""
+        if blocked:
+            return self.collision
+        earned = self._weight[index] * u if index >= 0 else 0.0
+        return earned + (self.new_cell if novel else 0.0)

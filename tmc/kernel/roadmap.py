@@ -1,0 +1,273 @@
+"""The road map that all parties agree on (Sec. II): which cells are road, which are closed, and how busy each one is.
+
+Reading the built-in maps (`maps/*.json`, package data) and a user's text raster is the only I/O of the kernel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.kernel.grid import OFF_GRID, STAY, Grid
+from tmc.kernel.raster import UNREACHABLE, Georeference, components, flood
+from tmc.kernel.rastertext import BLOCKED, FREE, ROAD, MapError, parse_text
+
+__all__ = [
+    "OBSTACLES",
+    "ROADS",
+    "UNREACHABLE",
+    "MapError",
+    "RoadMap",
+    "Street",
+    "builtin_maps",
+    "check",
+    "load_map",
+    "parse_raster",
+]
+
+ROADS = ("major", "main", "arterial", "all")
+OBSTACLES = ("none", "static", "event-day")
+CELL_M = 60.0
+"""The width of a cell, metres, where a text raster names none: the built-in map's."""
+Scalar = TypeVar("Scalar", bound=np.generic)
+MAX_BYTES = 2**18  # 65,535 one-cell rows with CRLF need 196,605 bytes; the rest is room for a header
+
+
+@dataclass(frozen=True)
+class Street:
+    """A street of a built-in map; `lonlat` are its vertices in degrees, (lon, lat) each."""
+
+    name: str
+    road_class: str
+    lonlat: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class RoadMap:
+    """A grid of square cells, each road, free or blocked; never both road and blocked. Arrays are read-only.
+
+    `road`, `blocked`: shape (K,). `blocked` holds static obstacles and no-fly cells. `cell_m`: metres.
+    `rates`: name -> shape (K,), relative, mean 1 over the road cells and 0 elsewhere; "uniform" is always there.
+    `streets`: those that the preset turned into road; empty for a user's raster.
+
+    Raises MapError when the arrays disagree.
+    """
+
+    name: str
+    grid: Grid
+    cell_m: float
+    road: NDArray[np.bool_]
+    blocked: NDArray[np.bool_]
+    rates: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    streets: tuple[Street, ...] = ()
+    attribution: str = ""
+    georeference: Georeference | None = None
+
+    def __post_init__(self) -> None:
+        rates = {"uniform": self.road.astype(np.float64), **self.rates}
+        if any(a.shape != (self.grid.size,) for a in (self.road, self.blocked, *rates.values())):
+            raise MapError(f"map '{self.name}' has an array without one value a cell: give {self.grid.size} in each")
+        if not self.road.any():
+            raise MapError(f"map '{self.name}' has no road cell, so there is nothing to patrol: mark some as road")
+        if (self.road & self.blocked).any():
+            raise MapError(f"map '{self.name}' has cells that are road and blocked: choose one for each")
+        if not (math.isfinite(self.cell_m) and self.cell_m > 0):
+            raise MapError(f"map '{self.name}' has cells of {self.cell_m} m: give a width above 0")
+        object.__setattr__(self, "road", _frozen(self.road))
+        object.__setattr__(self, "blocked", _frozen(self.blocked))
+        object.__setattr__(self, "rates", {name: _frozen(rate) for name, rate in rates.items()})
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256, hex, of the grid, road and blocked cells: two parties with the same one fly over the same map."""
+        shape = f"{self.grid.rows}x{self.grid.cols}:".encode()
+        return hashlib.sha256(shape + self._codes.tobytes()).hexdigest()
+
+    @cached_property
+    def road_distance(self) -> NDArray[np.int32]:
+        """Shape (K,): moves to the nearest road cell around what is blocked; UNREACHABLE (2^30) where there is no way.
+
+        0 on road; blocked cells are UNREACHABLE as well.
+        """
+        return _frozen(flood(self.grid, self.road, ~self.blocked))
+
+    @cached_property
+    def _codes(self) -> NDArray[np.uint8]:
+        """Shape (K,): 0 free, 1 road, 2 blocked."""
+        return np.where(self.blocked, 2, self.road).astype(np.uint8)
+
+    def lonlat(self, cell: int) -> tuple[float, float] | None:
+        """(lon, lat) of the centre of `cell` in degrees, or None where the map has no georeference."""
+        return None if self.georeference is None else self.georeference.lonlat(cell)
+
+    def csv(self) -> str:
+        """A line a row from the north: comma separated, 0 free, 1 road, 2 blocked; no header."""
+        return "".join(",".join(str(c) for c in row) + "\n" for row in self._rows())
+
+    def text(self) -> str:
+        """The raster that `load_map` reads: a line a row from the north, `.` free, `#` road, `X` blocked; no header."""
+        return "".join("".join((FREE, ROAD, BLOCKED)[c] for c in row) + "\n" for row in self._rows())
+
+    def _rows(self) -> list[list[int]]:
+        rows: list[list[int]] = self._codes.reshape(self.grid.rows, self.grid.cols).tolist()
+        return rows
+
+
+def _frozen(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """A read-only copy: maps are shared by all that fly over them."""
+    copy = array.copy()
+    copy.setflags(write=False)
+    return copy
+
+
+def builtin_maps() -> tuple[str, ...]:
+    """Names of the maps that ship with Overfly."""
+    folder = files("tmc.kernel").joinpath("maps")
+    return tuple(sorted(f.name.removesuffix(".json") for f in folder.iterdir() if f.name.endswith(".json")))
+
+
+def load_map(name: str, roads: str = "main", obstacles: str = "static") -> RoadMap:
+    """The built-in map `name`, or the text raster at that path.
+
+    `roads` says which classes are road: "major", "main" (major, plus Front and Church, which close the perimeter),
+    "arterial" or "all" (with collectors); a text raster has no classes, so all its roads count. `obstacles`: "none",
+    "static", or "event-day" (static, plus the event-day no-fly cells); a text raster keeps its X unless "none".
+    A road cell wins over a static obstacle; the event-day restriction closes road cells too. Raises MapError.
+    """
+    _choice("roads", roads, ROADS)
+    _choice("obstacles", obstacles, OBSTACLES)
+    if name in builtin_maps():
+        source = files("tmc.kernel").joinpath("maps", f"{name}.json")
+        return _from_document(json.loads(source.read_text("utf-8")), roads, obstacles)
+    return parse_raster(_read(name), Path(name).stem, name, keep_blocked=obstacles != "none")
+
+
+def _choice(setting: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise MapError(f"{setting} = '{value}' is not known: use one of {', '.join(known)}")
+
+
+def _read(path: str) -> str:
+    try:
+        with Path(path).open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+        text = raw.decode("utf-8-sig")
+    except FileNotFoundError:
+        known = ", ".join(builtin_maps())
+        raise MapError(f"no map and no file is called '{path}': use {known}, or the path of a text raster") from None
+    except UnicodeDecodeError as error:
+        raise MapError(f"{path}: byte {error.start + 1} is not UTF-8: save the raster as plain text") from None
+    except (OSError, ValueError) as error:  # a folder, no permission, a name that no file can have
+        reason = getattr(error, "strerror", None) or error
+        raise MapError(f"{path!r} cannot be read ({reason}): give the path of a readable text file") from None
+    if len(raw) > MAX_BYTES:
+        raise MapError(f"{path} is over {MAX_BYTES:,} bytes, too much for 65,535 cells: make the cells wider")
+    return text
+
+
+def parse_raster(text: str, name: str = "raster", where: str = "raster", *, keep_blocked: bool = True) -> RoadMap:
+    """A map from the text of a raster, as `parse_text` describes it. Raises MapError.
+
+    `name` is used when no header gives one; `where` is what messages call the text.
+    """
+    header, rows = parse_text(text, where)
+    cells = np.array([list(row) for row in rows]).ravel()
+    if not (cells == ROAD).any():
+        raise MapError(f"{where} has no road cell in its {len(rows)} rows: mark road cells with #")
+    return RoadMap(
+        name=header.get("name") or name,
+        grid=Grid(len(rows), len(rows[0])),
+        cell_m=float(header.get("cell_m", CELL_M)),
+        road=cells == ROAD,
+        blocked=(cells == BLOCKED) & keep_blocked,
+        attribution=header.get("attribution", ""),
+    )
+
+
+def _from_document(doc: dict[str, Any], roads: str, obstacles: str) -> RoadMap:
+    """A map from a document of `maps/`; these ship with the package and are tested, so they are trusted here."""
+    grid = Grid(doc["rows"], doc["cols"])
+    mapping = doc["mapping"]
+    origin = tuple(doc["window"]["origin_lonlat"])
+    geo = Georeference(grid, doc["cell_m"], origin, tuple(mapping["x"]), tuple(mapping["y"]))
+    preset = doc["presets"][roads]
+    chosen = [s for s in doc["streets"] if s["class"] in preset["classes"] or s["id"] in preset["streets"]]
+    road = np.zeros(grid.size, np.bool_)
+    for street in chosen:
+        road[geo.street_cells(np.array(street["lonlat"]))] = True
+    blocked = _cells(grid, doc["obstacles"] if obstacles != "none" else []) & ~road
+    closed = _cells(grid, doc["event_day"] if obstacles == "event-day" else [])
+    road &= ~closed
+    return RoadMap(
+        name=doc["name"],
+        grid=grid,
+        cell_m=doc["cell_m"],
+        road=road,
+        blocked=blocked | closed,
+        rates={rate: _rate(doc["rates"], rate, road) for rate in doc["rates"]["uncounted"]},
+        streets=tuple(Street(s["name"], s["class"], tuple((x, y) for x, y in s["lonlat"])) for s in chosen),
+        attribution=doc["attribution"],
+        georeference=geo,
+    )
+
+
+def _cells(grid: Grid, obstacles: list[dict[str, Any]]) -> NDArray[np.bool_]:
+    mask = np.zeros(grid.size, np.bool_)
+    mask[[grid.cell(row, col) for obstacle in obstacles for row, col in obstacle["cells"]]] = True
+    return mask
+
+
+def _rate(rates: dict[str, Any], name: str, road: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Shape (K,): scaled to mean 1 over the road cells of this preset, 0 elsewhere.
+
+    A road cell without a count (collectors, a quiet block of York St) gets the file's `uncounted` value, the lower
+    quartile of minor arterials: a road cell is never left without events only because nobody counted there.
+    """
+    table = np.array(rates[name], np.float64).ravel()  # null becomes NaN
+    values = np.where(np.isnan(table), rates["uncounted"][name], table) * road
+    return np.asarray(values / values[road].mean())
+
+
+def check(road_map: RoadMap) -> list[str]:
+    """What a user should look at before flying this map, a sentence each; empty for a map in good order.
+
+    Looks for several road components, dead ends, road cells that cannot be flown to from the largest piece of open
+    cells, and a share of road below 2 % or above 60 % (a wrong cell size, or dual carriageways two cells wide).
+    """
+    grid, road = road_map.grid, road_map.road
+    findings = []
+    pieces = components(grid, road)
+    if len(pieces) > 1:
+        sizes = ", ".join(str(p.size) for p in pieces[:5]) + (", ..." if len(pieces) > 5 else "")
+        findings.append(f"the road has {len(pieces)} components of {sizes} cells: join them, or keep the largest")
+    if ends := _places(grid, np.flatnonzero(road & (_road_neighbours(grid, road) < 2))):
+        findings.append(f"road cells that are dead ends, (row, col): {ends}")
+    apart = road.copy()
+    apart[components(grid, ~road_map.blocked)[0]] = False
+    if cut_off := _places(grid, np.flatnonzero(apart)):
+        findings.append(f"road cells that blocked cells cut off, (row, col): {cut_off}")
+    share = float(road.mean())
+    if not 0.02 <= share <= 0.6:
+        findings.append(f"{share:.1%} of the cells are road, where 2 % to 60 % is usual: look at the cell size")
+    return findings
+
+
+def _road_neighbours(grid: Grid, road: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Shape (K,): how many of the 8 neighbours of each cell are road."""
+    targets = grid.targets[:, :STAY]
+    return np.asarray((road[targets] & (targets != OFF_GRID)).sum(axis=1))
+
+
+def _places(grid: Grid, cells: NDArray[np.int64]) -> str:
+    """The first five cells as "(row, col)", and how many more there are."""
+    shown = ", ".join(f"({k // grid.cols}, {k % grid.cols})" for k in cells[:5].tolist())
+    return shown + (f" and {cells.size - 5} more" if cells.size > 5 else "")

@@ -1,0 +1,80 @@
+"""The world of a mission: its map, its rates, and what chance brings in each episode. Immutable, alike everywhere."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.kernel.config import Config, ConfigError
+from tmc.kernel.draws import Stream, distinct, uniforms
+from tmc.kernel.roadmap import RoadMap, load_map
+from tmc.kernel.uncertainty import UncertaintyLaw, arrival_probability
+
+
+class World:
+    """`config` on `road_map` (loaded by name when it is not given); raises ConfigError where the two do not fit."""
+
+    def __init__(self, config: Config, road_map: RoadMap | None = None) -> None:
+        self.config = config
+        self.map = road_map or load_map(config.world.map, config.world.roads, config.world.obstacles)
+        self.grid = self.map.grid
+        self.law = UncertaintyLaw(self.alpha, config.training.ticks)
+        self._check()
+
+    @cached_property
+    def alpha(self) -> NDArray[np.float64]:
+        """Shape (K,): events a tick in each cell; 0 where nothing can be visited."""
+        world = self.config.world
+        if world.rates not in self.map.rates:
+            known = ", ".join(sorted(self.map.rates))
+            raise ConfigError(f"world.rates = '{world.rates}' is unknown to the map {self.map.name}: choose {known}")
+        alpha = np.where(self.map.road, world.alpha * self.map.rates[world.rates], world.alpha_offroad)
+        return np.where(self.map.blocked, 0.0, alpha)
+
+    @cached_property
+    def start_cells(self) -> NDArray[np.int64]:
+        """Cells that a UAV may start on."""
+        road = self.config.world.start == "road"
+        return np.flatnonzero(~self.map.blocked & (self.map.road if road else True))
+
+    def _check(self) -> None:
+        size, roads = self.config.team.size, int(self.map.road.sum())
+        if size > roads:
+            raise ConfigError(
+                f"team.size = {size} is larger than the {roads} road cells of {self.map.name}: use {roads} or fewer"
+            )
+        if size > self.start_cells.size:
+            raise ConfigError(f"team.size = {size} is larger than the {self.start_cells.size} cells to start on")
+        if not self.law.cells.size:
+            raise ConfigError(f"no cell of {self.map.name} is monitored: every rate is 0")
+
+    def starts(self, episode: int) -> list[int]:
+        """The N distinct cells that the team starts an episode on (Algorithm 1)."""
+        n = self.config.team.size
+        u = uniforms(self.config.training.seed, Stream.STARTS, n, episode=episode)
+        return distinct(u, self.start_cells, n)
+
+    def initial_factor(self, episode: int) -> NDArray[np.float64] | None:
+        """Shape (R,): s_k = 1 - u_k(0), uniform in (0, 1], 1 under a UAV; None when all cells are visited at t = 0."""
+        if self.config.world.initial_map == "visited":
+            return None
+        u = uniforms(self.config.training.seed, Stream.AGES, self.grid.size, episode=episode)
+        u[self.starts(episode)] = 0.0
+        return np.asarray(1.0 - u[self.law.cells])
+
+    @cached_property
+    def _arrival(self) -> NDArray[np.float64]:
+        return arrival_probability(self.alpha)
+
+    def arrivals(self, episode: int, tick: int) -> NDArray[np.bool_]:
+        """Shape (K,): cells where an event arrives in [tick - 1, tick) (scenario I)."""
+        u = uniforms(self.config.training.seed, Stream.EVENTS, self.grid.size, episode=episode, tick=tick)
+        return np.asarray(u < self._arrival)
+
+    def explorations(self, episode: int, uav: int) -> NDArray[np.float64]:
+        """Shape (T_ep, 2): for each tick, the draw against epsilon and the draw that chooses an action."""
+        ticks = self.config.training.ticks
+        u = uniforms(self.config.training.seed, Stream.EXPLORATION, 2 * ticks, episode=episode, uav=uav)
+        return u.reshape(ticks, 2)

@@ -1,0 +1,95 @@
+"""Messages of the log, made from what the services hold, and back again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.record.errors import RecordError
+from tmc.record.schemas import FlightRecord, foxglove, message_class
+from tmc.wire.fields import FieldError
+from tmc.wire.messages import Record
+
+FRAME = "map"
+"""The frame of the grid: origin in its south-west corner, x east, y north, metres."""
+
+LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+"""Levels of foxglove.Log by name."""
+
+_NUMBERS = ("uav", "life", "sequence", "episode", "first", "tick", "version", "policy")
+_ARRAYS = {"cells": "<u2", "actions": "u1", "blocks": "u1", "rewards": "<f4", "seen_tick": "<u2", "seen_cell": "<u2"}
+
+
+def flight_record(record: Record) -> Any:
+    """The overfly.FlightRecord of a Record; `to_record` gives back the very same."""
+    numbers = {name: getattr(record, name) for name in _NUMBERS}
+    return FlightRecord(**numbers, **{name: getattr(record, name).tolist() for name in _ARRAYS})
+
+
+def to_record(proto: Any) -> Record:
+    """The Record of an overfly.FlightRecord; RecordError when it holds values that no Record may have."""
+    values: dict[str, Any] = {name: getattr(proto, name) for name in _NUMBERS}
+    try:
+        values |= {name: _array(getattr(proto, name), kind) for name, kind in _ARRAYS.items()}
+        return Record(**values)
+    except FieldError as error:
+        raise RecordError(f"a flight record of UAV {proto.uav} is not sound, so do not use this log: {error}") from None
+
+
+def _array(values: Any, kind: str) -> NDArray[Any]:
+    wide = np.array(values[:], np.float64 if kind == "<f4" else np.int64)
+    narrow = wide.astype(kind)
+    if not np.array_equal(wide, narrow):
+        raise FieldError("range", f"a value does not fit {kind}")
+    return narrow
+
+
+def grid(last_visit: NDArray[np.integer], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
+    """A foxglove.Grid of the ticks of the last visits, shape (K,), in cells of `cell_m` metres.
+
+    A Grid grows to the north, our rows to the south: so the rows are turned round. `last_visit` undoes it.
+    """
+    if last_visit.shape != (rows * cols,):
+        raise RecordError(f"a grid of {rows} x {cols} cells needs {rows * cols} values, not {last_visit.shape}")
+    message = message_class("foxglove.Grid")(
+        frame_id=FRAME,
+        column_count=cols,
+        cell_stride=4,
+        row_stride=4 * cols,
+        data=last_visit.reshape(rows, cols)[::-1].astype("<u4").tobytes(),
+    )
+    message.timestamp.FromNanoseconds(time_ns)
+    # Converters look for the sub-messages of a pose, and protobuf leaves out those that are all zero.
+    message.pose.position.SetInParent()
+    message.pose.orientation.w = 1.0
+    message.cell_size.x = message.cell_size.y = cell_m
+    message.fields.add(name="last_visit", offset=0, type=foxglove("PackedElementField").PackedElementField.UINT32)
+    return message
+
+
+def last_visit(message: Any) -> NDArray[np.uint32]:
+    """Shape (K,): the ticks that `grid` was given."""
+    return np.frombuffer(message.data, "<u4").reshape(-1, message.column_count)[::-1].ravel()
+
+
+def location_fix(lon: float, lat: float, time_ns: int, frame: str = FRAME, altitude: float = 0.0) -> Any:
+    """A foxglove.LocationFix: degrees (WGS 84), metres."""
+    message = message_class("foxglove.LocationFix")(frame_id=frame, latitude=lat, longitude=lon, altitude=altitude)
+    message.timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def geojson(text: str) -> Any:
+    """A foxglove.GeoJSON of a GeoJSON document."""
+    return message_class("foxglove.GeoJSON")(geojson=text)
+
+
+def log_message(level: str, text: str, name: str, time_ns: int) -> Any:
+    """A foxglove.Log: `name` is the process that speaks; RecordError when the level is none of LEVELS."""
+    if level not in LEVELS:
+        raise RecordError(f"there is no log level {level!r}: choose one of {', '.join(LEVELS)}")
+    message = message_class("foxglove.Log")(level=LEVELS[level], message=text, name=name)
+    message.timestamp.FromNanoseconds(time_ns)
+    return message

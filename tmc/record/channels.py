@@ -1,0 +1,65 @@
+"""What is logged: one table of topics, their schema, and the process that writes them; see `docs/log-format.md`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+from tmc.record.errors import RecordError
+
+ACTIVE = ".active"
+"""What is appended to the name of a log while it is written."""
+EVERY = "every"
+"""Writer of a topic that is found in the file of every process."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One row: `<id>` in `topic` stands for the number of a UAV; `process` is the role of the one that writes it."""
+
+    topic: str
+    schema: str
+    process: str
+    about: str
+
+    @cached_property
+    def pattern(self) -> re.Pattern[str]:
+        """Matches the topics of this row, and nothing else."""
+        return re.compile(re.escape(self.topic).replace("<id>", r"(0|[1-9][0-9]*)"))
+
+
+CHANNELS: tuple[Channel, ...] = (
+    Channel("/uav/<id>/record", "overfly.FlightRecord", "tmc", "each flight record accepted, once"),
+    Channel("/tmc/sync", "overfly.Sync", "tmc", "each answer to flight records: the map handed out, and to whom"),
+    Channel("/tmc/episode", "overfly.Episode", "tmc", "begin of an episode with the starts, end with its sums"),
+    Channel("/tmc/events", "overfly.Events", "tmc", "scenario I: tick and cell of each event that appears"),
+    Channel("/tmc/metrics", "overfly.TeamMetrics", "tmc", "uncertainty of the true map and the team's reward by tick"),
+    Channel("/tmc/last_visit", "foxglove.Grid", "tmc", "tick of the last visit of each cell, uint32"),
+    Channel("/map/roads", "foxglove.GeoJSON", "tmc", "the road network, once"),
+    Channel("/learner/policy", "overfly.Policy", "tmc", "each policy accepted, with its ONNX model"),
+    Channel("/learner/metrics", "overfly.LearnerMetrics", "learner", "loss, Q values and pace of learning"),
+    Channel("/uav/<id>/status", "overfly.UavStatus", "uav", "where the UAV is, how fast it flies, how long it waited"),
+    Channel("/uav/<id>/fix", "foxglove.LocationFix", "uav", "position in degrees, sampled"),
+    Channel("/log", "foxglove.Log", EVERY, "what the process says"),
+)
+
+
+def uav_topic(uav: int, name: str) -> str:
+    """The topic of one UAV, such as `/uav/3/record`."""
+    return f"/uav/{uav}/{name}"
+
+
+def role(process: str) -> str:
+    """The role of a process: `uav` for `uav-003`."""
+    return process.partition("-")[0]
+
+
+def find(topic: str, process: str) -> Channel:
+    """The row of a topic; RecordError when there is none, or when another process writes it."""
+    for channel in CHANNELS:
+        if channel.pattern.fullmatch(topic):
+            if channel.process in (EVERY, role(process)):
+                return channel
+            raise RecordError(f"topic {topic} is written by {channel.process}, not by {process}: log it there")
+    raise RecordError(f"there is no topic {topic}: add it to the table in tmc/record/channels.py, or correct its name")

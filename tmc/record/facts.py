@@ -1,0 +1,135 @@
+"""Facts of a run, typed, from `tmc.mcap` alone: who was where, how uncertain the map was, which events appeared.
+
+Delivery is at least once and services restart, so repeats are dropped here. A log that contradicts itself is refused.
+Of a damaged log these are the facts before the damage: `Log.damage` tells.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from array import array
+from collections import defaultdict
+from collections.abc import Collection, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.record.errors import RecordError
+from tmc.record.reader import Log, decode, run_files
+
+Folder = str | os.PathLike[str]
+_UNKNOWN = -1
+
+
+def _messages(folder: Folder, *schemas: str) -> Iterator[Any]:
+    """All messages of these schemas in tmc.mcap, in the order of the log."""
+    files = run_files(folder)
+    if "tmc" not in files:
+        raise RecordError(f"{folder} holds no tmc.mcap: give the folder of the run on the host where the TMC ran")
+    for raw in Log(files["tmc"]).raw():
+        if raw.schema in schemas:
+            yield decode(raw)
+
+
+class Tracks:
+    """The cells of all UAVs in one episode, tick by tick: four bytes a move."""
+
+    def __init__(self, episode: int) -> None:
+        self.episode = episode
+        self._cells: dict[int, array[int]] = {}
+
+    def add(self, record: Any) -> None:
+        """Take in an overfly.FlightRecord; RecordError when it puts a UAV where it was not."""
+        cells = self._cells.setdefault(record.uav, array("i"))
+        new, first = record.cells[:], record.first
+        cells.extend([_UNKNOWN] * (first + len(new) - len(cells)))
+        for tick, cell in enumerate(new, start=first):
+            if cells[tick] not in (_UNKNOWN, cell):
+                raise RecordError(
+                    f"two records disagree where UAV {record.uav} was at tick {tick} of episode {self.episode}: "
+                    "the log mixes two runs, so use neither"
+                )
+            cells[tick] = cell
+
+    def rows(self) -> NDArray[np.uint32]:
+        """Shape (moves, 3): tick, uav, cell, in order of tick and uav."""
+        parts = [np.zeros((0, 3), np.int64)]
+        for uav, track in sorted(self._cells.items()):
+            cells = np.array(track, np.int64)
+            ticks = np.flatnonzero(cells != _UNKNOWN)
+            parts.append(np.stack((ticks, np.full_like(ticks, uav), cells[ticks]), axis=1))
+        rows = np.concatenate(parts)
+        return rows[np.argsort(rows[:, 0], kind="stable")].astype(np.uint32)
+
+
+def tracks(folder: Folder) -> dict[int, Tracks]:
+    """{episode: tracks} of all flight records, in order of the episodes; a (uav, sequence) counts once."""
+    found: dict[int, Tracks] = {}
+    known: dict[int, set[int]] = defaultdict(set)
+    for record in _messages(folder, "overfly.FlightRecord"):
+        if record.sequence not in known[record.uav]:
+            known[record.uav].add(record.sequence)
+            found.setdefault(record.episode, Tracks(record.episode)).add(record)
+    return dict(sorted(found.items()))
+
+
+def moves(folder: Folder, episode: int) -> Iterator[tuple[int, int, int]]:
+    """(tick, uav, cell) for ticks 0..T, in order of tick and uav."""
+    found = tracks(folder)
+    _check_held(folder, episode, found)
+    return ((t, uav, cell) for t, uav, cell in found[episode].rows().tolist())
+
+
+def digest(folder: Folder) -> str:
+    """SHA-256 of what was flown: (episode, tick, uav, cell) as little-endian uint32, in that order of sorting.
+
+    Two runs with the same digest flew exactly the same.
+    """
+    sha = hashlib.sha256()
+    for episode, flown in tracks(folder).items():
+        rows = flown.rows()
+        sha.update(np.insert(rows, 0, episode, axis=1).astype("<u4").tobytes())
+    return sha.hexdigest()
+
+
+def uncertainty(folder: Folder, episode: int) -> Iterator[tuple[int, float]]:
+    """(tick, sum over cells of the uncertainty of the true map), in order of tick."""
+    values: dict[int, dict[int, float]] = defaultdict(dict)
+    for m in _messages(folder, "overfly.TeamMetrics"):
+        values[m.episode].update(enumerate(m.uncertainty[:], start=m.first))
+    _check_held(folder, episode, values)
+    return iter(sorted(values[episode].items()))
+
+
+def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
+    """(tick, cell) of each event of scenario I, in that order; none in scenario II."""
+    found: dict[int, set[tuple[int, int]]] = defaultdict(set)
+    for m in _messages(folder, "overfly.Events", "overfly.Episode"):
+        held = found[m.episode]
+        if m.DESCRIPTOR.name == "Events":
+            held.update(zip(m.ticks[:], m.cells[:], strict=True))
+    _check_held(folder, episode, found)
+    return iter(sorted(found[episode]))
+
+
+def episodes(folder: Folder) -> list[Any]:
+    """The overfly.Episode messages, in the order of the log."""
+    return list(_messages(folder, "overfly.Episode"))
+
+
+def _check_held(folder: Folder, episode: int, held: Collection[int]) -> None:
+    if episode not in held:
+        raise RecordError(f"{folder} holds nothing of episode {episode}: ask for one of {_ranges(held)}")
+
+
+def _ranges(numbers: Collection[int]) -> str:
+    """Numbers in words: `1 to 3, 7`."""
+    spans: list[list[int]] = []
+    for n in sorted(numbers):
+        if spans and n == spans[-1][1] + 1:
+            spans[-1][1] = n
+        else:
+            spans.append([n, n])
+    return ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in spans) or "those that are flown from now on"

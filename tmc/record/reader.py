@@ -1,0 +1,198 @@
+"""Reads logs back: finished, still written, or cut off by a crash. What is given out is sound; nothing is guessed."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+from mcap.records import Attachment, Metadata
+
+from tmc.record.channels import ACTIVE
+from tmc.record.errors import RecordError
+from tmc.record.frames import MAGIC, DamageError, Raw, contents
+from tmc.record.schemas import message_class
+
+_LOG_NAME = re.compile(rf"(tmc|learner|uav-\d+)\.mcap({re.escape(ACTIVE)})?")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A message of a log. `log_time`, `publish_time`: ns; `sequence`: a counter a topic; `message`: protobuf."""
+
+    topic: str
+    log_time: int
+    publish_time: int
+    sequence: int
+    message: Any
+
+
+class Log:
+    """One log file. RecordError when it is missing, empty, or no MCAP at all; damage further on is noted instead."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        _check_start(self.path)
+        self._damage: DamageError | None = None
+        self._read = False
+        self._finished = False
+
+    def raw(self, topics: Collection[str] | None = None) -> Iterator[Raw]:
+        """All sound messages in file order, of these topics only when given, not decoded."""
+        for item in self._items():
+            if isinstance(item, list):
+                yield from (raw for raw in item if topics is None or raw.topic in topics)
+
+    def entries(self, topics: Collection[str] | None = None) -> Iterator[Entry]:
+        """All sound messages in file order, of these topics only when given."""
+        for raw in self.raw(topics):
+            yield Entry(raw.topic, raw.log_time, raw.publish_time, raw.sequence, decode(raw))
+
+    @property
+    def damage(self) -> str | None:
+        """What is wrong with the file and where, or None: nothing behind that place is read.
+
+        A file that is still written is not damaged for having no end. Reads the whole file unless that was done.
+        """
+        self._know()
+        if self._damage is not None:
+            return f"{self.path.name}: {self._damage}"
+        if not self._finished and not self.path.name.endswith(ACTIVE):
+            return f"{self.path.name}: it is cut, at byte {self.path.stat().st_size}"
+        return None
+
+    @property
+    def cut(self) -> bool:
+        """True when all that is wrong is that the file ends too early, as after a kill."""
+        self._know()
+        return not self._finished and (self._damage is None or self._damage.cut)
+
+    @property
+    def finished(self) -> bool:
+        """True when the file was closed in order and is sound to its end."""
+        self._know()
+        return self._finished
+
+    def metadata(self) -> dict[str, str]:
+        """All facts in the file; where lives of a process differ, the last one's."""
+        found: dict[str, str] = {}
+        for item in self._items():
+            if isinstance(item, Metadata):
+                found |= item.metadata
+        return found
+
+    def attachments(self) -> list[Attachment]:
+        """The files within the file: name, media_type, data."""
+        return [item for item in self._items() if isinstance(item, Attachment)]
+
+    def _know(self) -> None:
+        if not self._read:
+            for _ in self._items():
+                pass
+
+    def _items(self) -> Iterator[list[Raw] | Metadata | Attachment | None]:
+        damage, finished = None, False
+        try:
+            with self.path.open("rb") as file:
+                for item in contents(file):
+                    finished = item is None
+                    yield item
+        except DamageError as error:
+            damage = error
+        self._damage, self._finished, self._read = damage, finished, True
+
+
+def _check_start(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(MAGIC))
+    except OSError as error:
+        raise RecordError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
+    if not start:
+        raise RecordError(f"{path} is empty: its process was killed before it wrote, so there is nothing to read")
+    if not MAGIC.startswith(start):
+        raise RecordError(f"{path} is not an MCAP file: give one that ends in .mcap or .mcap{ACTIVE}")
+
+
+def decode(raw: Raw) -> Any:
+    """The protobuf message: of our own class where we know the schema, else of the class that the file describes."""
+    try:
+        return _class(raw.schema, raw.described).FromString(raw.data)
+    except (DecodeError, KeyError, TypeError):
+        raise RecordError(f"a message on {raw.topic} is no {raw.schema}: the log was made by something else") from None
+
+
+@cache
+def _class(schema: str, described: bytes) -> Any:
+    try:
+        return message_class(schema)
+    except RecordError:
+        pool = descriptor_pool.DescriptorPool()
+        for file in descriptor_pb2.FileDescriptorSet.FromString(described).file:
+            pool.Add(file)
+        return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema))
+
+
+def read(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Iterator[Entry]:
+    """All sound messages of a log in file order; `Log` also tells of damage."""
+    return Log(path).entries(topics)
+
+
+def run_files(folder: str | os.PathLike[str]) -> dict[str, Path]:
+    """{process: its log} of a run, `tmc` and `learner` first; RecordError when the folder holds none.
+
+    Where both names exist, a resumed log is just taking over from the finished one, and holds all of it.
+    """
+    folder = Path(folder)
+    paths = sorted(p for p in folder.glob("*.mcap*") if _LOG_NAME.fullmatch(p.name))
+    if not paths:
+        raise RecordError(f"{folder} holds no logs of a run (tmc.mcap and others): give the folder of a run")
+    found = {path.name.partition(".")[0]: path for path in paths}
+    return dict(sorted(found.items(), key=lambda item: (item[0].startswith("uav"), item[0] != "tmc", item[0])))
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic: messages, bytes of payload before compression, and first and last log time (ns)."""
+
+    schema: str
+    count: int
+    bytes: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Info:
+    """A log at a glance: `bytes` on disk; `first` and `last` log time (ns), None when it holds no message."""
+
+    path: Path
+    bytes: int
+    finished: bool
+    damage: str | None
+    topics: Mapping[str, TopicInfo]
+
+    @property
+    def first(self) -> int | None:
+        return min((t.first for t in self.topics.values()), default=None)
+
+    @property
+    def last(self) -> int | None:
+        return max((t.last for t in self.topics.values()), default=None)
+
+
+def info(path: str | os.PathLike[str]) -> Info:
+    """Count what a log holds."""
+    log = Log(path)
+    topics: dict[str, TopicInfo] = {}
+    for raw in log.raw():
+        old = topics.get(raw.topic, TopicInfo(raw.schema, 0, 0, raw.log_time, raw.log_time))
+        size = old.bytes + len(raw.data)
+        topics[raw.topic] = TopicInfo(raw.schema, old.count + 1, size, old.first, max(old.last, raw.log_time))
+    return Info(log.path, log.path.stat().st_size, log.finished, log.damage, dict(sorted(topics.items())))

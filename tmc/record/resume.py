@@ -1,0 +1,28 @@
+"""Goes on with the log of an earlier life: copies what is sound in it to the file of the new one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tmc.record.reader import Log
+
+if TYPE_CHECKING:
+    from tmc.record.writer import LogWriter
+
+
+def copy(old: Path, new: LogWriter) -> None:
+    """Copy all sound messages and attachments of `old`, numbers and times kept.
+
+    The torn end that a kill leaves is dropped. Where anything else is wrong, the old file is kept as `*.damaged`,
+    since there may be sound chunks behind the damage.
+    """
+    if old.stat().st_size == 0:
+        return
+    log = Log(old)
+    for attachment in log.attachments():
+        new.attach(attachment.name, attachment.media_type, attachment.data)
+    for raw in log.raw():
+        new.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
+    if log.damage is not None and not log.cut:
+        old.replace(old.with_name(old.name + ".damaged"))

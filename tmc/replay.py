@@ -1,0 +1,173 @@
+"""The replay memory D: flight records in flat rings, and observations rebuilt from them on sampling (DESIGN idea 3).
+
+A row is one tick of the whole team: where each UAV stood, the action and reward that brought it there, and which map
+frame it last got from the TMC. What UAV i believed at tick t follows: the frame, then the local updates of the ticks
+since (Sec. II-D). So a transition costs about 11 bytes and its share of a frame, not two images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.kernel.draws import Stream, uniforms
+from tmc.kernel.observation import Floats, Ints, Observer
+from tmc.kernel.world import World
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A minibatch: see `tmc.wire.messages.Minibatch` for the shapes. `row`, `uav`: where each transition stands."""
+
+    row: Ints
+    uav: Ints
+    observation: Floats
+    action: NDArray[np.uint8]
+    reward: Floats
+    next_observation: Floats
+    discount: Floats
+    allowed: NDArray[np.uint8]
+
+
+class Ring:
+    """A flat array addressed by ever-growing numbers, of which the newest `length` are kept."""
+
+    def __init__(self, length: int, width: int, dtype: str) -> None:
+        self.data = np.zeros((length, width) if width else length, dtype)
+
+    def __setitem__(self, number: int, value: object) -> None:
+        self.data[number % len(self.data)] = value
+
+    def __getitem__(self, number: Ints) -> NDArray[Any]:
+        return np.asarray(self.data[number % len(self.data)])
+
+
+class Replay:
+    """Holds the newest `replay.capacity` transitions of a mission; pure: rows in, minibatches out."""
+
+    def __init__(self, world: World, observer: Observer) -> None:
+        config = world.config
+        self.world, self.observer = world, observer
+        self.n_step, self.gamma = config.dqn.n_step, config.dqn.gamma
+        team, ticks = config.team.size, config.training.ticks
+        self._starts_kept = max(1, config.replay.capacity // team)
+        episodes = self._starts_kept // ticks + 2
+        rows = self._starts_kept + self.n_step + episodes + 1
+        R = world.law.cells.size
+        self._events = config.scenario == 1
+        frames = (rows // config.T_u + 4 * (episodes + 1)) * (1 if config.comms.phase == "together" else team)
+        self.cells, self.actions = Ring(rows, team, "u2"), Ring(rows, team, "u1")
+        self.rewards, self.base = Ring(rows, team, "f4"), Ring(rows, team, "i8")
+        self.tick, self.episode = Ring(rows, 0, "u2"), Ring(rows, 0, "i8")
+        self.frames = Ring(frames, (R + 7) // 8 if self._events else R, "u1" if self._events else "u2")
+        self.frame_tick = Ring(frames, 0, "u2")
+        self.starts, self.ends = Ring(self._starts_kept, 0, "i8"), Ring(self._starts_kept, 0, "i8")
+        self.rows_in = self.frames_in = self.starts_in = 0
+        self._factors: dict[int, NDArray[np.float64]] = {}
+
+    def __len__(self) -> int:
+        """Transitions that can be drawn."""
+        return min(self.starts_in, self._starts_kept) * self.world.config.team.size
+
+    def add_frame(self, tick: int, frame: NDArray[np.generic]) -> int:
+        """Keep a map as a UAV got it at `tick`: last visits (R,) u16, or e_k (R,) bool in scenario I. Its number."""
+        self.frames[self.frames_in] = np.packbits(frame.astype(bool)) if self._events else frame
+        self.frame_tick[self.frames_in] = tick
+        self.frames_in += 1
+        return self.frames_in - 1
+
+    def add_row(
+        self,
+        episode: int,
+        tick: int,
+        cells: NDArray[np.uint16],
+        actions: NDArray[np.uint8],
+        rewards: Floats,
+        base: Ints,
+    ) -> None:
+        """Tick `tick` of `episode`, ticks in order from 0. Shapes (N,): actions and rewards that led to this tick."""
+        row = self.rows_in
+        self.cells[row], self.actions[row], self.rewards[row], self.base[row] = cells, actions, rewards, base
+        self.tick[row], self.episode[row] = tick, episode
+        self.rows_in += 1
+        if tick == 0:
+            self._remember(episode)
+        oldest = tick - self.n_step
+        newest = tick - 1 if tick == self.world.config.training.ticks else oldest  # a time limit cuts n-step sums short
+        for start_tick in range(max(0, oldest), newest + 1):
+            self.starts[self.starts_in], self.ends[self.starts_in] = row - tick + start_tick, row
+            self.starts_in += 1
+
+    def _remember(self, episode: int) -> None:
+        """Keep the initial map of an episode, and drop those of episodes of which no row is left."""
+        factor = self.world.initial_factor(episode)
+        if factor is not None:
+            self._factors[episode] = factor
+        oldest = int(self.episode[np.array(max(0, self.rows_in - len(self.tick.data)))])
+        for gone in [e for e in self._factors if e < oldest]:
+            del self._factors[gone]
+
+    def sample(self, number: int, batch: int) -> Sample:
+        """Minibatch `number` (which addresses the draws), uniform over all transitions held."""
+        u = uniforms(self.world.config.training.seed, Stream.REPLAY, 2 * batch, tick=number)
+        held = min(self.starts_in, self._starts_kept)
+        place = self.starts_in - held + (u[:batch] * held).astype(np.int64)
+        uav = (u[batch:] * self.world.config.team.size).astype(np.int64)
+        return self.rebuild(self.starts[place].astype(np.int64), self.ends[place].astype(np.int64), uav)
+
+    def rebuild(self, start: Ints, end: Ints, uav: Ints) -> Sample:
+        """Transitions of UAVs `uav` from rows `start` to rows `end`. Shapes (B,)."""
+        B = start.size
+        obs, allowed = self.observe(np.concatenate([start, end]), np.concatenate([uav, uav]))
+        action = self.actions[start + 1][np.arange(B), uav]
+        reward, discount = np.zeros(B), np.ones(B)
+        for k in range(1, self.n_step + 1):
+            live = start + k <= end
+            r = self.rewards[np.minimum(start + k, end)][np.arange(B), uav]
+            reward += np.where(live, discount * r, 0.0)
+            discount = np.where(live, discount * self.gamma, discount)
+        return Sample(
+            start, uav, obs[:B], action.astype(np.uint8), reward.astype(np.float32),
+            obs[B:], discount.astype(np.float32), allowed[B:],
+        )  # fmt: skip
+
+    def observe(self, row: Ints, uav: Ints) -> tuple[Floats, NDArray[np.uint8]]:
+        """o_i at these rows, exactly as the UAVs saw it, and the actions they would allow. Shapes (B,)."""
+        batch = np.arange(row.size)
+        team = self.cells[row].astype(np.int64)
+        cells = team[batch, uav]
+        sensed = self.observer.sensed(cells, team, uav)
+        obs = self.observer.observe_batch(cells, team, sensed, self.belief(row, uav))
+        return obs, self.observer.allowed_batch(cells, team, sensed)
+
+    def belief(self, row: Ints, uav: Ints) -> NDArray[np.float64]:
+        """U_i over the monitored cells, shape (B, R), float64."""
+        base = self.base[row][np.arange(row.size), uav].astype(np.int64)
+        frame = self.frames[base]
+        if self._events:
+            bits = np.unpackbits(frame.astype(np.uint8), axis=1, count=self.world.law.cells.size)
+            return bits.astype(np.float64)
+        last_visit = self._local_updates(row, uav, frame.astype(np.uint16), self.frame_tick[base].astype(np.int64))
+        s = None
+        if self.world.config.world.initial_map == "random":
+            s = np.stack([self._factors[int(e)] for e in self.episode[row].tolist()])
+        return self.world.law.values(last_visit, self.tick[row].astype(np.int64)[:, None], s)
+
+    def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
+        """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers."""
+        tick = self.tick[row].astype(np.int64)
+        index, R = self.world.law.index, last_visit.shape[1]
+        padded = np.concatenate([last_visit, np.zeros((row.size, 1), np.uint16)], axis=1)
+        for k in range(1, int((tick - since).max(initial=0)) + 1):
+            live = np.flatnonzero(since + k <= tick)
+            t = (since + k)[live]
+            team = self.cells[row[live] - (tick[live] - t)].astype(np.int64)
+            cells = team[np.arange(live.size), uav[live]]
+            known = self.observer.sensed(cells, team, uav[live])
+            known[np.arange(live.size), uav[live]] = True
+            where = np.where(known, index[team], -1)
+            padded[live[:, None], np.where(where < 0, R, where)] = t[:, None]
+        return padded[:, :R]

@@ -1,0 +1,418 @@
+"""The traffic management centre as a core without I/O: a message comes in, messages, journal entries and notes go out.
+
+It holds the roster, the flight of the current episode, the replay memory, the limiter and the newest policy. Time is an
+argument and randomness is addressed, so playing the same messages again gives the same answers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from tmc.flight import Exchange, Flight, RefusedError, Truth
+from tmc.kernel.config import flat
+from tmc.kernel.observation import Observer
+from tmc.kernel.reward import Block, RewardLaw
+from tmc.kernel.world import World
+from tmc.limiter import Limiter
+from tmc.replay import Replay
+from tmc.wire import messages as m
+
+LEARNER = "learner"
+
+
+def uav_name(i: int) -> str:
+    """The address of UAV i's process."""
+    return f"uav-{i:03d}"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A journal entry: the topic, and the fields of its schema (docs/log-format.md)."""
+
+    topic: str
+    values: dict[str, Any]
+
+
+@dataclass
+class Outbox:
+    """What the core wants done: messages to send, entries to journal, notes for the log. The service empties it."""
+
+    sends: list[tuple[str, m.Message]] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)
+    notes: list[tuple[str, str]] = field(default_factory=list)
+
+    def take(self) -> Outbox:
+        """All of it; this outbox is empty afterwards."""
+        taken = Outbox(self.sends, self.entries, self.notes)
+        self.sends, self.entries, self.notes = [], [], []
+        return taken
+
+
+@dataclass
+class Member:
+    """A UAV on the roster: its process's life, when it was last heard of, and the answer it last got."""
+
+    life: int = -1
+    heard: float = 0.0
+    sequence: int = 0
+    answer: m.Map | None = None
+    named: bool = False
+
+
+class Station:
+    """The TMC's state. `learning`: whether a learner takes part; `policy`: the file to fly when none does."""
+
+    def __init__(
+        self, world: World, run: str, *, learning: bool, policy: bytes | None = None, tracks: str = ""
+    ) -> None:
+        config = world.config
+        self.world, self.config, self.run, self.tracks = world, config, run, tracks
+        self.learning = learning
+        self.observer = Observer(world)
+        self.replay = Replay(world, self.observer)
+        self.reward = RewardLaw(config, world.law.q)
+        ratio = config.replay.updates_per_tick if learning else 0.0
+        self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
+        self.roster = [Member() for _ in range(config.team.size)]
+        self.flight: Flight | None = None
+        self.version = self.ticks = self.episodes = self.rejected = self.blocked = 0
+        self.uncertainty = self.episode_uncertainty = self.loss = 0.0
+        self.policy_version = 0
+        self.policies: dict[int, bytes] = {}
+        self.learner_life = -1
+        self.out = Outbox()
+        self._held: list[tuple[str, m.Message]] = []
+        self._requests: list[int] = []
+        self._ended = False
+        if policy is not None:
+            self._take_policy(1, policy, 0, 0.0)
+
+    # What the world sees of it.
+
+    @property
+    def phase(self) -> str:
+        """gathering (not everybody is here), flying, learning (the learner catches up), or done."""
+        if self.flight is not None:
+            return "flying"
+        if self.episodes < self.config.training.episodes:
+            return "gathering"
+        return "learning" if self.limiter.owed else "done"
+
+    def status(self) -> m.Status:
+        """Progress, for whoever asks."""
+        flight = self.flight
+        waiting = ", ".join(self.waiting_for())
+        return m.Status(
+            self.phase, flight.episode if flight else self.episodes, max(flight.done, 0) if flight else 0, self.ticks,
+            self.limiter.updates, self.policy_version, self.loss, self.uncertainty, self.episode_uncertainty,
+            self.blocked, self.rejected, waiting,
+        )  # fmt: skip
+
+    def waiting_for(self) -> list[str]:
+        """Who keeps the mission from going on: processes not here yet, or UAVs whose record is due next."""
+        if self.flight is None:
+            if self.phase != "gathering":
+                return []
+            missing = [uav_name(i) for i, member in enumerate(self.roster) if member.life < 0]
+            return missing + ([LEARNER] if self.learning and not self.policy_version else [])
+        flight, t = self.flight, self.flight.next_exchange
+        return [uav_name(i) for i in range(flight.N) if self.config.due(i, t) and flight.reported[i] < t]
+
+    # Messages in.
+
+    def handle(self, sender: str, message: m.Message, now: float) -> None:
+        """Take one message from `sender` at time `now`, seconds; everything that follows from it is in `out`."""
+        handler = _HANDLERS.get(type(message))
+        if handler is None:
+            self.reject(sender, "state", f"{type(message).__name__} is not a message for the TMC")
+            return
+        handler(self, sender, message, now)
+
+    def reject(self, sender: str, code: str, text: str) -> None:
+        """Count and note a frame that changes nothing, and tell its sender what was wrong."""
+        self.rejected += 1
+        self.out.notes.append(("WARNING", f"rejected a frame from {sender}: {text}"))
+        self._send(sender, m.Error(code, text[:1024]))
+
+    def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
+        config = json.dumps(flat(self.config))
+        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks)
+        if hello.role == "learner":
+            if not self.learning:
+                self.reject(sender, "refused", "this mission has no learner: it flies a fixed policy")
+                return
+            self.learner_life = hello.life
+            self._requests.clear()
+            self._send(sender, welcome)
+            return
+        if not 0 <= hello.uav < len(self.roster):
+            self.reject(sender, "refused", f"there is no UAV {hello.uav} in a team of {len(self.roster)}")
+            return
+        member = self.roster[hello.uav]
+        if member.life not in {-1, hello.life}:
+            self.out.notes.append(("WARNING", f"{sender} is back with a new process"))
+        member.life, member.heard = hello.life, now
+        self._send(sender, welcome)
+        if self.phase == "done" or self._ended:
+            self._send(sender, m.End("the mission is over"))
+        elif self.flight is not None:
+            self._resume(hello.uav)
+        else:
+            self._try_begin()
+
+    def _record(self, sender: str, record: m.Record, now: float) -> None:
+        if not 0 <= record.uav < len(self.roster) or uav_name(record.uav) != sender:
+            self.reject(sender, "refused", f"{sender} cannot ship a record of UAV {record.uav}")
+            return
+        member = self.roster[record.uav]
+        if record.life != member.life:
+            self.reject(sender, "fenced", f"a newer process flies {sender}: leave")
+            return
+        member.heard, member.named = now, False
+        if record.sequence < member.sequence:  # a repeat: it is known, and perhaps answered
+            if member.answer is not None and member.answer.sequence == record.sequence:
+                self._send(sender, member.answer)
+            return
+        if self.flight is None or record.episode != self.flight.episode or record.sequence > member.sequence:
+            self.reject(sender, "state", f"record {record.sequence} of {sender} is not the next one")
+            return
+        self._accept(sender, record, member)
+
+    def _accept(self, sender: str, record: m.Record, member: Member) -> None:
+        flight = self.flight
+        assert flight is not None
+        try:
+            flight.accept(record)
+        except RefusedError as refused:
+            self.reject(sender, "refused", str(refused))
+            return
+        member.sequence += 1
+        self.out.entries.append(Entry(f"/uav/{record.uav:03d}/record", {"record": record}))
+        for exchange in flight.exchanges():
+            self._answer(flight, exchange)
+        self._journal_truth(flight, flight.settle())
+        if flight.over:
+            self._end_episode(flight)
+        self._release()
+        self._serve()
+
+    def _answer(self, flight: Flight, exchange: Exchange) -> None:
+        self.version = exchange.version
+        values = {
+            "episode": flight.episode, "tick": exchange.tick, "version": exchange.version,
+            "policy": self.policy_version, "uavs": exchange.uavs, "believed": exchange.believed,
+        }  # fmt: skip
+        self.out.entries.append(Entry("/tmc/sync", values))
+        if flight.scenario == 2:
+            self.out.entries.append(Entry("/tmc/last_visit", {"last_visit": self._whole(flight.believed)}))
+        for i in exchange.uavs:
+            answer = flight.answer(exchange, self.policy_version, self.roster[i].sequence - 1)
+            self._held.append((uav_name(i), answer))
+
+    def _whole(self, last_visit: np.ndarray[Any, np.dtype[np.uint16]]) -> np.ndarray[Any, np.dtype[np.uint32]]:
+        """Last visits over all K cells."""
+        whole = np.zeros(self.world.grid.size, np.uint32)
+        whole[self.world.law.cells] = last_visit
+        return whole
+
+    def _journal_truth(self, flight: Flight, truth: Truth) -> None:
+        if not truth.uncertainty:
+            return
+        moves = len(truth.uncertainty) - (truth.first == 0)
+        self.ticks += moves
+        self.limiter.insert(moves, len(self.replay))
+        self.uncertainty = truth.uncertainty[-1]
+        self.out.entries.append(
+            Entry("/tmc/metrics", {
+                "episode": flight.episode, "first": truth.first, "steps": self.ticks * flight.N,
+                "updates": self.limiter.updates, "policy": self.policy_version,
+                "uncertainty": truth.uncertainty, "reward": [float(r.mean()) for r in truth.reward],
+            })
+        )  # fmt: skip
+        if truth.events:
+            ticks, cells = zip(*truth.events, strict=True)
+            values = {"episode": flight.episode, "ticks": list(ticks), "cells": list(cells)}
+            self.out.entries.append(Entry("/tmc/events", values))
+
+    # Episodes.
+
+    def _try_begin(self) -> None:
+        ready = all(member.life >= 0 for member in self.roster)
+        policy = self.policy_version > 0 or self.config.team.pilot != "policy"
+        if self.phase == "gathering" and ready and policy:
+            self._begin_episode()
+
+    def _begin_episode(self) -> None:
+        episode = self.episodes + 1
+        self.flight = flight = Flight(self.world, self.reward, self.replay, episode, self.version)
+        self._journal_episode(flight, "begin")
+        for i, member in enumerate(self.roster):
+            member.answer = None
+            self._held.append((uav_name(i), self._begin_message(flight, i)))
+        self._release()
+
+    def _begin_message(self, flight: Flight, i: int) -> m.Begin:
+        """Fly from the last record that the TMC has; at the start of an episode, from its beginning."""
+        shipped = flight.reported[i]
+        tick = max(shipped, 0)
+        visited = np.unique(flight.cells[: tick + 1, i]).astype("<u2")
+        return m.Begin(
+            flight.episode, tick, int(flight.cells[tick, i]), shipped, self.roster[i].sequence, flight.version,
+            self.policy_version, flight.beliefs[i].copy(), visited, m.EMPTY,
+        )  # fmt: skip
+
+    def _resume(self, i: int) -> None:
+        flight, member = self.flight, self.roster[i]
+        assert flight is not None
+        self._send(uav_name(i), self._begin_message(flight, i))
+        if member.answer is not None and member.answer.tick == flight.reported[i]:
+            self._send(uav_name(i), member.answer)
+
+    def _end_episode(self, flight: Flight) -> None:
+        self.episodes = flight.episode
+        self.blocked += sum(flight.blocked.values())
+        self.episode_uncertainty = flight.total_uncertainty / flight.T
+        self._journal_episode(flight, "end")
+        self.flight = None
+        if self.episodes < self.config.training.episodes:
+            self._begin_episode()
+        else:
+            self._finish_if_done()
+
+    def _journal_episode(self, flight: Flight, phase: str) -> None:
+        mean = flight.total_uncertainty / flight.T
+        self.out.entries.append(
+            Entry("/tmc/episode", {
+                "episode": flight.episode, "phase": phase, "starts": flight.starts, "ticks": max(flight.done, 0),
+                "uncertainty": mean, "uncertainty_per_cell": mean / self.world.law.cells.size,
+                "reward": [float(r) for r in flight.total_reward], "blocked_grid": flight.blocked[Block.GRID],
+                "blocked_obstacle": flight.blocked[Block.OBSTACLE], "blocked_uav": flight.blocked[Block.UAV],
+                "epsilon": self.config.epsilon(flight.episode), "updates": self.limiter.updates,
+                "steps": self.ticks * flight.N,
+            })
+        )  # fmt: skip
+
+    def _finish_if_done(self) -> None:
+        """Send everybody home: the UAVs when the last episode is over, the learner when it has caught up."""
+        if self.phase == "learning" and self.learner_life >= 0:
+            return
+        if not self._ended:
+            self._ended = True
+            for i in range(len(self.roster)):
+                self._held.append((uav_name(i), m.End("the mission is over")))
+            if self.learning:
+                self._send(LEARNER, m.End("the mission is over"))
+
+    # Answers held back by the limiter.
+
+    def _release(self) -> None:
+        if self.limiter.may_insert or self.flight is None:
+            for to, message in self._held:
+                if isinstance(message, m.Map):
+                    self.roster[int(to[4:])].answer = message
+                self._send(to, message)
+            self._held.clear()
+
+    def _send(self, to: str, message: m.Message) -> None:
+        self.out.sends.append((to, message))
+
+    # The learner.
+
+    def _sample_request(self, sender: str, request: m.SampleRequest, _now: float) -> None:
+        if sender != LEARNER or not self.learning:
+            self.reject(sender, "refused", "only the learner may ask for a minibatch")
+            return
+        if len(self._requests) >= 8:
+            self.reject(sender, "refused", "more than 8 minibatch requests in flight")
+            return
+        self._requests.append(request.request)
+        self._serve()
+
+    def _serve(self) -> None:
+        """Answer minibatch requests as far as the limiter allows."""
+        while self._requests and self.limiter.owed:
+            s = self.replay.sample(self.limiter.updates, self.config.dqn.batch)
+            self.limiter.sample()
+            self._send(LEARNER, m.Minibatch(
+                self._requests.pop(0), self.episodes, self.ticks, s.observation, s.action, s.reward,
+                s.next_observation, s.discount, s.allowed,
+            ))  # fmt: skip
+        self._release()
+        if self._requests and self.phase == "done":
+            self._finish_if_done()
+
+    def _policy_push(self, sender: str, push: m.PolicyPush, _now: float) -> None:
+        if sender != LEARNER or not self.learning:
+            self.reject(sender, "refused", "only the learner may push a policy")
+            return
+        if push.version <= self.policy_version:
+            self.reject(sender, "refused", f"policy {push.version} is not newer than {self.policy_version}")
+            return
+        self._take_policy(push.version, push.model, push.updates, push.loss)
+        self._send(sender, m.Ack(push.version))
+        self._try_begin()
+
+    def _take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
+        self.policy_version, self.loss = version, loss
+        self.policies[version] = model
+        needed = {version} | {a.policy for a in (member.answer for member in self.roster) if a is not None}
+        needed |= {a.policy for _, a in self._held if isinstance(a, m.Map | m.Begin)}
+        self.policies = {v: p for v, p in self.policies.items() if v in needed}
+        digest = hashlib.sha256(model).hexdigest()
+        values = {"version": version, "updates": updates, "sha256": digest, "loss": loss}
+        self.out.entries.append(Entry("/learner/policy", values))
+
+    def _policy_request(self, sender: str, request: m.PolicyRequest, _now: float) -> None:
+        # Superseded since it was named: the newest is the one to fly, and the record will say so.
+        version = request.version if request.version in self.policies else self.policy_version
+        if version not in self.policies:
+            self.reject(sender, "state", f"there is no policy {request.version}")
+            return
+        self._send(sender, m.Policy(version, self.policies[version]))
+
+    # The rest.
+
+    def _beacon(self, sender: str, beacon: m.Beacon, _now: float) -> None:
+        if uav_name(beacon.uav) != sender:
+            self.reject(sender, "refused", f"{sender} cannot send a beacon of UAV {beacon.uav}")
+            return
+        for i in beacon.to.tolist():
+            if i < len(self.roster) and i != beacon.uav:
+                self._send(uav_name(i), beacon)
+
+    def _status_request(self, sender: str, _request: m.StatusRequest, _now: float) -> None:
+        self._send(sender, self.status())
+
+    def _bye(self, sender: str, bye: m.Bye, _now: float) -> None:
+        if bye.reason:
+            self.out.notes.append(("INFO", f"{sender} leaves: {bye.reason}"))
+
+    def tick(self, now: float) -> None:
+        """Name, once each, the UAVs that the others wait for and that have been silent for too long."""
+        patience = self.config.comms.patience
+        if self.flight is None:
+            return
+        for name in self.waiting_for():
+            member = self.roster[int(name[4:])]
+            if not member.named and member.heard and now - member.heard > patience:
+                member.named = True
+                text = f"{name} has been silent for {patience:g} s at tick {self.flight.next_exchange}; others wait"
+                self.out.notes.append(("WARNING", text))
+
+
+_HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {
+    m.Hello: Station._hello,
+    m.Record: Station._record,
+    m.SampleRequest: Station._sample_request,
+    m.PolicyPush: Station._policy_push,
+    m.PolicyRequest: Station._policy_request,
+    m.Beacon: Station._beacon,
+    m.StatusRequest: Station._status_request,
+    m.Bye: Station._bye,
+}
