@@ -67,7 +67,7 @@ class Pilot:
         self.decider, self._make_decider, self._planner = planner, make_decider, planner
         self.phase = Phase.IDLE
         self.episode = self.t = self.cell = self.sequence = self.version = 0
-        self.policy = self._wanted = 0
+        self.policy = self.wanted = 0
         self.explored = self.steps = 0
         self.pending: Record | None = None
 
@@ -111,12 +111,12 @@ class Pilot:
         self.phase = then
         if self._planner is not None or version == self.policy:
             return None
-        self.phase, self._then, self._wanted = Phase.POLICY, then, version
+        self.phase, self._then, self.wanted = Phase.POLICY, then, version
         return PolicyRequest(version)
 
     def on_policy(self, policy: Policy) -> None:
         """The policy that was asked for. Raises PolicyError when it cannot fly here."""
-        if self.phase is Phase.POLICY and policy.version >= self._wanted:
+        if self.phase is Phase.POLICY and policy.version >= self.wanted:
             self.decider = self._make_decider(policy.model)
             self.policy, self.phase = policy.version, self._then
 

@@ -142,14 +142,12 @@ class Station:
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))
-        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks)
+        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks, self.policy_version)
         if hello.role == "learner":
             if not self.learning:
                 self.reject(sender, "refused", "this mission has no learner: it flies a fixed policy")
                 return
-            self.learner_life = hello.life
-            self._requests.clear()
-            self._send(sender, welcome)
+            self._learner_hello(sender, hello, welcome)
             return
         if not 0 <= hello.uav < len(self.roster):
             self.reject(sender, "refused", f"there is no UAV {hello.uav} in a team of {len(self.roster)}")
@@ -165,6 +163,14 @@ class Station:
             self._resume(hello.uav)
         else:
             self._try_begin()
+
+    def _learner_hello(self, sender: str, hello: m.Hello, welcome: m.Welcome) -> None:
+        """A learner is here, perhaps back from an older checkpoint: what it lost since is owed to it again."""
+        if hello.life != self.learner_life:
+            self.learner_life = hello.life
+            self._requests.clear()
+            self.limiter.updates = min(self.limiter.updates, hello.updates)
+        self._send(sender, welcome)
 
     def _record(self, sender: str, record: m.Record, now: float) -> None:
         if not 0 <= record.uav < len(self.roster) or uav_name(record.uav) != sender:

@@ -90,7 +90,8 @@ def _check_end(file: IO[bytes], at: int, body: bytes, crc: int, summary: bool) -
     _check_crc(at, body, crc, "the summary")
     end = file.read(len(MAGIC) + 1)
     if end != MAGIC:
-        raise DamageError(at, "its end is not MCAP's", cut=MAGIC.startswith(end))
+        cut = MAGIC.startswith(end)
+        raise DamageError(at, "it is cut" if cut else "its end is not MCAP's", cut)
 
 
 def _check_crc(at: int, body: bytes, crc: int, what: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 def copy(old: Path, new: LogWriter) -> None:
     """Copy all sound messages and attachments of `old`, numbers and times kept.
 
-    The torn end that a kill leaves is dropped. Where anything else is wrong, the old file is kept as `*.damaged`,
+    The torn end that a kill leaves is dropped. Where anything else is wrong, the old file is kept as `*.damaged-1`,
     since there may be sound chunks behind the damage.
     """
     if old.stat().st_size == 0:
@@ -25,4 +26,5 @@ def copy(old: Path, new: LogWriter) -> None:
     for raw in log.raw():
         new.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
     if log.damage is not None and not log.cut:
-        old.replace(old.with_name(old.name + ".damaged"))
+        names = (old.with_name(f"{old.name}.damaged-{n}") for n in count(1))
+        next(name for name in names if not name.exists()).hardlink_to(old)

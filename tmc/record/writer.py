@@ -12,15 +12,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from mcap.writer import CompressionType, Writer
 
 from tmc.kernel.config import Journal
-from tmc.record import builders, channels, schemas
-from tmc.record.channels import ACTIVE
-from tmc.record.errors import RecordError, unwritable
+from tmc.record import builders, channels, disk, schemas
+from tmc.record.errors import RecordError
 
 FORMAT = "1"
 """Version of the log format, in the metadata of each file."""
@@ -56,36 +54,24 @@ class LogWriter:
         timer: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path, self.process = Path(path), process
-        self.active = self.path.with_name(self.path.name + ACTIVE)
+        self.active = self.path.with_name(self.path.name + channels.ACTIVE)
         self._journal, self._clock, self._timer = journal, clock, timer
         self._channels: dict[str, _Channel] = {}
         self._schemas: dict[str, int] = {}
-        self._last = 0
-        self._closed = ""
-        old = self._before(resume)
-        name = self.active.with_name(self.active.name + ".new") if old else self.active
+        self._last, self._closed = 0, ""
         self._flushed, self._synced = timer(), False
+        old = disk.left_behind(self.path, resume)
+        name = self.active.with_name(self.active.name + ".new") if old else self.active
         try:
             self._file = name.open("wb" if old else "xb")
         except OSError as error:
-            raise RecordError(unwritable(self.path, error)) from None
+            raise RecordError(disk.unwritable(self.path, error)) from None
         self._writer = Writer(self._file, journal.chunk, CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
         try:
             self._start(dict(metadata), old, name)
         except BaseException:
             self._give_up()
             raise
-
-    def _before(self, resume: bool) -> Path | None:
-        """What an earlier life left behind; refuses to write over it. A file of 0 bytes is nothing."""
-        if self.path.suffix != ".mcap":
-            raise RecordError(f"{self.path} must end in .mcap: correct the name of the log")
-        for old in (self.active, self.path):
-            if resume and old.is_file():
-                return old
-            if old.exists():
-                raise RecordError(f"{old} exists already: choose a new run folder, or resume the run that is in it")
-        return None
 
     def _start(self, metadata: dict[str, str], old: Path | None, name: Path) -> None:
         with self._guard():
@@ -182,7 +168,7 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @contextmanager
@@ -199,7 +185,7 @@ class LogWriter:
 
     def _fail(self, error: OSError) -> RecordError:
         """Half a chunk may be in the file now, so nothing may follow it: give the file up as it is."""
-        self._closed = unwritable(self.path, error)
+        self._closed = disk.unwritable(self.path, error)
         self._give_up()
         return RecordError(self._closed)
 
@@ -208,12 +194,7 @@ class LogWriter:
             self._file.raw.close()
 
     def _sync(self) -> None:
-        """Wait for the disk: for the file, and once for the folder, that it knows the file."""
         os.fsync(self._file.fileno())
-        if not self._synced:
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        if not self._synced:  # once, so that the folder knows the file
+            disk.sync_folder(self.path.parent)
             self._synced = True

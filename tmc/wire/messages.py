@@ -42,12 +42,16 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class Welcome(Message):
-    """The mission that the TMC runs: all settings, the map's fingerprint, and the number of the run."""
+    """The mission that the TMC runs: all settings, the map's fingerprint, the run, the newest policy it has.
+
+    `tracks`: the table that the UAVs on the TMC's machine share; empty where they tell each other by beacon.
+    """
 
     config: str = f.text(65_536)
     map: str = f.text(64)
     run: str = f.text(64)
     tracks: str = f.text(4096)
+    policy: int = f.integer(0, 2**62)
 
 
 @dataclass(frozen=True)

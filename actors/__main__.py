@@ -1,0 +1,54 @@
+"""`python -m actors`: the process of one UAV. `overfly actor` starts the same."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+# One thread for the arithmetic of a UAV; must be set before NumPy is imported.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from actors.service import Left, Service
+from tmc.kernel.config import ConfigError
+from tmc.kernel.policy import PolicyError
+from tmc.kernel.roadmap import MapError
+from tmc.record.errors import RecordError
+from tmc.wire import messages, process
+from tmc.wire.sockets import EndpointError
+
+MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError)
+
+
+def fly(uav: int, endpoint: str, out: Path) -> int:
+    """Fly UAV `uav` until its TMC ends the mission; returns the exit code."""
+    stop = process.Stop()
+    service = Service(uav, endpoint, out)
+    try:
+        service.fly(stop)
+        return process.DONE
+    except Left as left:
+        service.say(messages.Bye("uav", uav, str(left)))
+        if left.code != process.DONE:
+            print(f"overfly: UAV {uav}: {left}", file=sys.stderr)
+        return left.code
+    finally:
+        service.close()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse the options of a child process and fly."""
+    parser = argparse.ArgumentParser("actors", description=__doc__)
+    parser.add_argument("--id", type=int, required=True, help="number of the UAV, from 0")
+    parser.add_argument("--connect", required=True, help="the TMC's endpoint for UAVs")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the UAV's log")
+    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    a = parser.parse_args(argv)
+    process.die_with_parent(a.parent)
+    return process.run(lambda: fly(a.id, a.connect, a.out), MISTAKES)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

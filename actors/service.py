@@ -1,0 +1,214 @@
+"""A UAV as a process: a socket, a clock and a log around one pilot, one loop."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from actors.airspace import Tracks, Waiting
+from actors.pilot import Phase, Pilot
+from actors.planners import PREFIX, Decider, PlannerDecider
+from actors.radio import RadioTracks
+from actors.tracks import TableTracks, open_table
+from tmc.kernel.config import build
+from tmc.kernel.observation import Observer
+from tmc.kernel.world import World
+from tmc.record.builders import location_fix
+from tmc.record.channels import uav_topic
+from tmc.record.schemas import UavStatus
+from tmc.record.writer import LogWriter
+from tmc.wire import messages as m
+from tmc.wire import process, sockets
+from tmc.wire.codec import CodecError
+
+SILENCE = 1.0
+"""Seconds after which a message that was not answered goes out again."""
+STATUS_EVERY = 0.5
+"""Seconds between two status messages in the log."""
+NAPS = (0.0, 0.0, 0.0, 50e-6, 100e-6, 200e-6, 400e-6, 1e-3)
+"""Seconds that a wait for a peer sleeps, from the first to the last try: 0 gives the core to somebody else."""
+
+
+class Left(Exception):  # noqa: N818  not an error: the flight is over
+    """The TMC sent this UAV home, or away; carries the exit code and the sentence for it."""
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class Service:
+    """UAV `uav` of the mission that the TMC at `endpoint` runs; logs to `out`."""
+
+    def __init__(self, uav: int, endpoint: str, out: Path) -> None:
+        self.uav, self.out = uav, out
+        self.life = int.from_bytes(os.urandom(7), "big")
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.sock = sockets.dealer(self.context, endpoint, f"uav-{uav:03d}")
+        self.log: LogWriter | None = None
+        self.waited = 0.0
+        self._said = time.monotonic()
+        self._reported, self._status_due = (self._said, 0), 0.0
+
+    def fly(self, stop: Callable[[], bool]) -> None:
+        """The main loop; raises Left when the TMC ends it."""
+        self.pilot, self.radio = self._join(stop)
+        pilot, naps = self.pilot, 0
+        while not stop():
+            try:
+                record = pilot.advance()
+            except Waiting as waiting:
+                self._wait_for_peer(waiting, naps)
+                naps += 1
+                continue
+            naps = 0
+            if record is not None:
+                self.say(record)
+                self._report(record)
+            self._listen(0.1)
+        self.say(m.Bye("uav", self.uav, "stopped"))
+
+    def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
+        """Say hello until the TMC answers, and build the pilot of the mission that it names."""
+        hello = m.Hello("uav", self.uav, self.life)
+        while not stop():
+            self.say(hello)
+            if self.sock.poll(int(SILENCE * 1000)):
+                message = self._receive()
+                if isinstance(message, m.Welcome):
+                    return self._make_pilot(message)
+                self._obey(message)
+        raise Left(process.DONE, "stopped before the TMC answered")
+
+    def _make_pilot(self, welcome: m.Welcome) -> tuple[Pilot, RadioTracks | None]:
+        config = build(json.loads(welcome.config))
+        world = World(config)
+        if world.map.fingerprint != welcome.map:
+            raise Left(process.USAGE, f"the map '{config.world.map}' here is not the one that the TMC flies: copy it")
+        self.out.mkdir(parents=True, exist_ok=True)
+        path = self.out / f"uav-{self.uav:03d}.mcap"
+        self.log = LogWriter(path, f"uav-{self.uav:03d}", config.journal, {"run": welcome.run}, resume=True)
+        observer, team = Observer(world), config.team.size
+        tracks: Tracks
+        radio = None
+        if welcome.tracks:
+            tracks = TableTracks(open_table(Path(welcome.tracks), team, config.training.ticks), self.uav)
+        else:
+            tracks = radio = RadioTracks(self.uav, team, world.grid, observer.sensing, self._beacon)
+
+        def decider(model: bytes) -> Decider:
+            from actors.policy import NetworkDecider  # noqa: PLC0415  planners start without ONNX Runtime
+
+            return NetworkDecider(model, config, observer)
+
+        who = config.team.pilot
+        planner = PlannerDecider(world, who) if who.startswith(PREFIX) else None
+        return Pilot(world, self.uav, self.life, tracks, observer, decider, planner), radio
+
+    # The radio.
+
+    def say(self, message: m.Message) -> None:
+        """Put a message on the air; it may be lost."""
+        self._said = time.monotonic()
+        sockets.send(self.sock, message)
+
+    def _beacon(self, beacon: m.Beacon) -> None:
+        sockets.send(self.sock, beacon)
+
+    def _receive(self) -> m.Message | None:
+        try:
+            return sockets.receive_message(self.sock)
+        except CodecError as error:
+            self._note("WARNING", f"dropped a frame: {error}")
+            return None
+
+    def _listen(self, patience: float) -> None:
+        """Take what has come in; wait up to `patience` seconds for it, and speak again after too long a silence."""
+        if not self.sock.poll(int(patience * 1000)):
+            if time.monotonic() - self._said > SILENCE:
+                self._repeat()
+            return
+        while (message := self._receive()) is not None:
+            answer = self._obey(message)
+            if answer is not None:
+                self.say(answer)
+
+    def _repeat(self) -> None:
+        """Silence: what was sent may be lost, and with it the TMC's memory of this process."""
+        pilot = self.pilot
+        if pilot.phase is Phase.MAP and pilot.pending is not None:
+            self.say(pilot.pending)
+        elif pilot.phase is Phase.POLICY:
+            self.say(m.PolicyRequest(pilot.wanted))
+        else:
+            self.say(m.Hello("uav", self.uav, self.life))
+
+    def _obey(self, message: m.Message | None) -> m.Message | None:
+        """Act on a message of the TMC or a peer; returns what to say to it."""
+        if isinstance(message, m.Begin):
+            return self.pilot.begin(message)
+        if isinstance(message, m.Map):
+            return self.pilot.on_map(message)
+        if isinstance(message, m.Policy):
+            self.pilot.on_policy(message)
+        elif isinstance(message, m.Beacon) and self.radio is not None:
+            self.radio.hear(message)
+        elif isinstance(message, m.End):
+            raise Left(process.DONE, message.reason)
+        elif isinstance(message, m.Error):
+            self._on_error(message)
+        return None
+
+    def _on_error(self, error: m.Error) -> None:
+        self._note("ERROR", f"the TMC says: {error.text}")
+        if error.code == "fenced":
+            raise Left(process.FENCED, error.text)
+        if error.code in {"refused", "version"}:
+            raise Left(process.USAGE, f"the TMC refused: {error.text}")
+
+    def _wait_for_peer(self, waiting: Waiting, tries: int) -> None:
+        """Wait for the cell of a peer. The table is looked at again soon; beacons wake the socket."""
+        start = time.monotonic()
+        if self.radio is not None:
+            if not self.sock.poll(200):
+                self.radio.ask(waiting.peer, waiting.tick)
+            self._listen(0)
+        else:
+            time.sleep(NAPS[min(tries, len(NAPS) - 1)])
+            if tries % 32 == 31:
+                self._listen(0)
+        self.waited += time.monotonic() - start
+
+    # The log.
+
+    def _note(self, level: str, text: str) -> None:
+        if self.log is not None:
+            self.log.log(level.lower(), text)
+
+    def _report(self, record: m.Record) -> None:
+        """Where the UAV is, how fast it flies and how long it waited: for whoever looks at the log."""
+        now = time.monotonic()
+        if now < self._status_due or self.log is None:
+            return
+        pilot, (then, steps) = self.pilot, self._reported
+        rate = (pilot.steps - steps) / (now - then)
+        self._reported, self._status_due = (now, pilot.steps), now + STATUS_EVERY
+        self.log.write(uav_topic(self.uav, "status"), UavStatus(
+            uav=self.uav, episode=record.episode, tick=record.tick, cell=pilot.cell, waited=self.waited,
+            steps_per_second=rate, explored=pilot.explored, lead=pilot.airspace.lead(pilot.t),
+        ))  # fmt: skip
+        where = pilot.world.map.lonlat(pilot.cell)
+        if where is not None:
+            self.log.write(uav_topic(self.uav, "fix"), location_fix(*where, self.log.now()))
+
+    def close(self) -> None:
+        """Close the socket and the log."""
+        self.context.destroy(linger=200)
+        if self.log is not None:
+            self.log.close()

@@ -1,0 +1,46 @@
+"""`python -m learner`: the learner process. `overfly learner` starts the same."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads must not spin where UAVs want the core
+
+from learner.checkpoint import CheckpointError
+from learner.service import Service
+from tmc.kernel.config import ConfigError
+from tmc.kernel.roadmap import MapError
+from tmc.record.errors import RecordError
+from tmc.wire import process
+from tmc.wire.sockets import EndpointError
+
+MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError)
+
+
+def learn(endpoint: str, out: Path) -> int:
+    """Learn until the TMC ends the mission; returns the exit code."""
+    stop = process.Stop()
+    service = Service(endpoint, out)
+    try:
+        service.learn(stop)
+        return process.DONE
+    finally:
+        service.close()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse the options of a child process and learn."""
+    parser = argparse.ArgumentParser("learner", description=__doc__)
+    parser.add_argument("--connect", required=True, help="the TMC's endpoint for UAVs; the learner's lies beside it")
+    parser.add_argument("--out", type=Path, required=True, help="run folder")
+    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    a = parser.parse_args(argv)
+    process.die_with_parent(a.parent)
+    return process.run(lambda: learn(a.connect, a.out), MISTAKES)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""The learner as a process: a socket, a clock and a log around the trainer, one loop with requests in flight."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import zmq
+
+from learner import checkpoint
+from learner.trainer import Trainer, UpdateMetrics
+from tmc.kernel.config import build
+from tmc.kernel.policy import view_shape
+from tmc.kernel.world import World
+from tmc.record.schemas import LearnerMetrics
+from tmc.record.writer import LogWriter
+from tmc.wire import messages as m
+from tmc.wire import sockets
+from tmc.wire.codec import CodecError
+
+WINDOW = 2
+"""Minibatch requests in flight, so that the learner never waits for the way there and back."""
+SILENCE = 5.0
+"""Seconds without a minibatch after which the learner says hello again: the TMC may have been started anew."""
+METRICS_EVERY = 0.2
+"""Seconds between two metrics messages in the log."""
+
+
+class Service:
+    """The learner of the mission that the TMC at `endpoint` runs; logs, checkpoints and policies go to `out`."""
+
+    def __init__(self, endpoint: str, out: Path) -> None:
+        self.out = out
+        self.life = int.from_bytes(os.urandom(7), "big")
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.sock = sockets.dealer(self.context, sockets.feed_endpoint(endpoint), "learner")
+        self.log: LogWriter | None = None
+        self._request = 0
+        self._idle = 0.0
+        self._metrics_due = 0.0
+        self._loss = 0.0
+
+    def learn(self, stop: Callable[[], bool]) -> bool:
+        """The main loop; True when the mission came to its end, False when stopped. Leaves checkpoint and policy."""
+        welcome = self._join(stop)
+        if welcome is None:
+            return False
+        self._prepare(welcome)
+        self._push()
+        for _ in range(WINDOW):
+            self._ask()
+        over = False
+        while not over and not stop():
+            for message in self._listen():
+                over |= self._obey(message)
+        self._finish()
+        return over
+
+    def _join(self, stop: Callable[[], bool]) -> m.Welcome | None:
+        """Say hello until the TMC answers."""
+        saved = checkpoint.newest(self.out / "checkpoints")
+        updates = checkpoint.read(saved)[0].updates if saved else 0
+        while not stop():
+            sockets.send(self.sock, m.Hello("learner", -1, self.life, updates))
+            if self.sock.poll(1000):
+                message = self._receive()
+                if isinstance(message, m.Welcome):
+                    return message
+        return None
+
+    def _prepare(self, welcome: m.Welcome) -> None:
+        config = build(json.loads(welcome.config))
+        torch.set_num_threads(config.training.threads)
+        world = World(config)
+        self.config = config
+        self.trainer = Trainer(config, view_shape(config, world.grid), world.grid)
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.log = LogWriter(self.out / "learner.mcap", "learner", config.journal, {"run": welcome.run}, resume=True)
+        saved = checkpoint.newest(self.out / "checkpoints")
+        if saved is not None:
+            checkpoint.load(saved, self.trainer)
+            self.log.log("info", f"goes on from {saved.name}")
+        self.trainer.version = max(self.trainer.version, welcome.policy)
+        self._start = self._told = time.monotonic()
+        self._told_updates = self.trainer.updates
+
+    def _listen(self) -> list[m.Message]:
+        """What has come in; the time spent waiting for it is the learner's idle time."""
+        start = time.monotonic()
+        if not self.sock.poll(int(SILENCE * 1000)):
+            sockets.send(self.sock, m.Hello("learner", -1, self.life, self.trainer.updates))
+        self._idle += time.monotonic() - start
+        message = self._receive()
+        return [] if message is None else [message]
+
+    def _receive(self) -> m.Message | None:
+        try:
+            return sockets.receive_message(self.sock)
+        except CodecError as error:
+            if self.log is not None:
+                self.log.log("warning", f"dropped a frame: {error}")
+            return None
+
+    def _obey(self, message: m.Message) -> bool:
+        """Act on a message of the TMC; True when the mission is over."""
+        if isinstance(message, m.Minibatch):
+            self._ask()
+            self._update(message)
+        elif isinstance(message, m.Welcome):  # a TMC that has lost our requests
+            for _ in range(WINDOW):
+                self._ask()
+        elif isinstance(message, m.Error) and self.log is not None:
+            self.log.log("error", f"the TMC says: {message.text}")
+        return isinstance(message, m.End)
+
+    def _ask(self) -> None:
+        self._request += 1
+        sockets.send(self.sock, m.SampleRequest(self._request))
+
+    def _update(self, minibatch: m.Minibatch) -> None:
+        metrics = self.trainer.update(minibatch)
+        self._loss = metrics.loss
+        if metrics.updates % self.config.training.push_every == 0:
+            self._push()
+        if metrics.updates % self.config.training.checkpoint_every == 0:
+            checkpoint.save(self.out / "checkpoints", self.trainer)
+        self._report(metrics, minibatch)
+
+    def _push(self) -> bytes:
+        version, model = self.trainer.policy()
+        sockets.send(self.sock, m.PolicyPush(version, self.trainer.updates, self._loss, model))
+        return model
+
+    def _report(self, metrics: UpdateMetrics, minibatch: m.Minibatch) -> None:
+        now = time.monotonic()
+        if now < self._metrics_due or self.log is None:
+            return
+        span = max(now - self._told, 1e-9)
+        self.log.write("/learner/metrics", LearnerMetrics(
+            updates=metrics.updates, episode=minibatch.episodes, steps=minibatch.ticks * self.config.team.size,
+            loss=metrics.loss, q_mean=metrics.q_mean, target_mean=metrics.target_mean, td_abs=metrics.td_abs,
+            grad_norm=metrics.grad_norm, updates_per_second=(metrics.updates - self._told_updates) / span,
+            idle_share=min(self._idle / span, 1.0), wall=now - self._start,
+        ))  # fmt: skip
+        self._told, self._told_updates, self._idle = now, metrics.updates, 0.0
+        self._metrics_due = now + METRICS_EVERY
+
+    def _finish(self) -> None:
+        """The last checkpoint, the last policy, and its file."""
+        checkpoint.save(self.out / "checkpoints", self.trainer)
+        write_policy(self.out / "policies" / "final.onnx", self._push())
+        sockets.send(self.sock, m.Bye("learner", -1, f"{self.trainer.updates} updates"))
+
+    def close(self) -> None:
+        """Close the socket and the log."""
+        self.context.destroy(linger=500)
+        if self.log is not None:
+            self.log.close()
+
+
+def write_policy(path: Path, model: bytes) -> None:
+    """Write a policy file whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_suffix(".new")
+    new.write_bytes(model)
+    new.replace(path)

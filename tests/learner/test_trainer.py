@@ -1,0 +1,241 @@
+"""Algorithm 1's update, its target copy, and the state that a checkpoint needs."""
+
+import math
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+from learner import dqn, qnet
+from learner.intake import TrainingError
+from learner.trainer import Trainer, copy_due
+from tmc.kernel.config import build
+from tmc.kernel.grid import Grid
+from tmc.kernel.policy import KEY, PolicyCard, card_for
+
+
+def weights(net):
+    return torch.cat([p.detach().flatten() for p in net.parameters()])
+
+
+def same(a, b):
+    """True when the two trainers have the same state, bit for bit."""
+    a, b = a.state(), b.state()
+    counters = (a.updates, a.version, a.copied) == (b.updates, b.version, b.copied)
+    return counters and all(torch.equal(a.tensors[k], b.tensors[k]) for k in a.tensors | b.tensors)
+
+
+def plain_updates(config, shape, batches):
+    """The weights after these minibatches: plain layout, Adam as Kingma and Ba give it, theta- never copied."""
+    net, target = qnet.build(config, shape), qnet.build(config, shape)
+    lr, (b1, b2), eps = config.dqn.learning_rate, (0.9, 0.999), 1e-8
+    m, v = ([torch.zeros_like(p) for p in net.parameters()] for _ in range(2))
+    for t, batch in enumerate(batches, start=1):
+        o, o_next, reward, discount, allowed = (
+            torch.tensor(x)
+            for x in (batch.observation, batch.next_observation, batch.reward, batch.discount, batch.allowed)
+        )
+        with torch.no_grad():
+            choice = net(o_next) if config.dqn.double else None
+            y = dqn.target(reward * config.dqn.reward_scale, discount, target(o_next), allowed, choice)
+        net.zero_grad()
+        dqn.loss(dqn.td_error(net(o), torch.tensor(batch.action, dtype=torch.int64), y), config.dqn.loss).backward()
+        with torch.no_grad():
+            for p, mean, square in zip(net.parameters(), m, v, strict=True):
+                mean.mul_(b1).add_((1 - b1) * p.grad)
+                square.mul_(b2).add_((1 - b2) * p.grad**2)
+                p.sub_(lr * (mean / (1 - b1**t)) / ((square / (1 - b2**t)).sqrt() + eps))
+    return net
+
+
+def test_updates_are_plain_adam_on_the_plain_equations(preset, trainer_of, minibatch_of):
+    trainer = trainer_of(preset)
+    batches = [minibatch_of(preset, n) for n in range(4)]
+    for batch in batches:
+        trainer.update(batch)
+    plain = plain_updates(preset, trainer.shape, batches)
+    torch.testing.assert_close(weights(trainer.online), weights(plain), atol=2e-5, rtol=0)
+    assert not torch.allclose(weights(trainer.online), weights(trainer.target), atol=1e-4)
+
+
+def test_metrics_are_those_of_the_minibatch_before_the_step(small, trainer_of, minibatch_of):
+    config = small({"dqn.reward_scale": 0.5})
+    trainer, batch = trainer_of(config), minibatch_of(config)
+    net = qnet.build(config, trainer.shape)
+    q = net(torch.tensor(batch.observation)).detach().numpy()[np.arange(6), batch.action]
+    q_next = net(torch.tensor(batch.next_observation)).detach().numpy()
+    y = 0.5 * batch.reward + 0.99 * np.where(batch.allowed, q_next, -np.inf).max(1)
+    metrics = trainer.update(batch)
+    assert metrics.updates == trainer.updates == 1
+    assert metrics.loss == pytest.approx(np.mean((q - y) ** 2), rel=1e-5)
+    assert metrics.q_mean == pytest.approx(q.mean(), rel=1e-5)
+    assert metrics.target_mean == pytest.approx(y.mean(), rel=1e-5)
+    assert metrics.td_abs == pytest.approx(np.abs(q - y).mean(), rel=1e-5)
+    grads = torch.cat([p.grad.flatten() for p in trainer.online.parameters()])
+    assert metrics.grad_norm == pytest.approx(float(grads.norm()), rel=1e-5)
+
+
+def copies(trainer, minibatch_of, episodes):
+    """The indices of the minibatches, stamped with these counts of episodes, before which theta- was set to theta."""
+    found = []
+    for i, n in enumerate(episodes):
+        theta, before = weights(trainer.online), weights(trainer.target)
+        trainer.update(minibatch_of(trainer.config, i, episodes=n))
+        after = weights(trainer.target)
+        if not torch.equal(before, after):
+            assert torch.equal(after, theta)
+            found.append(i)
+    return found
+
+
+def test_target_follows_exactly_every_five_episodes(small, trainer_of, minibatch_of):
+    episodes = [n // 3 for n in range(51)]  # three updates an episode
+    assert copies(trainer_of(small()), minibatch_of, episodes) == [15, 30, 45]
+
+
+def test_target_follows_once_when_the_count_jumps_over_a_multiple(small, trainer_of, minibatch_of):
+    assert copies(trainer_of(small()), minibatch_of, [0, 4, 7, 8, 9, 10, 10, 23, 24, 25]) == [2, 5, 7, 9]
+
+
+def test_target_counts_afresh_when_a_new_run_starts_from_old_weights(small, trainer_of, minibatch_of):
+    assert copies(trainer_of(small()), minibatch_of, [0, 12, 0, 4, 5]) == [1, 4]
+
+
+def test_target_follows_every_so_many_updates(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small({"dqn.target_episodes": 0, "dqn.target_updates": 3}))
+    for n in range(1, 8):
+        trainer.update(minibatch_of(trainer.config, n, episodes=n))
+        assert torch.equal(weights(trainer.online), weights(trainer.target)) == (n % 3 == 0)
+
+
+def test_target_follows_by_both_rules_at_once(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small({"dqn.target_episodes": 5, "dqn.target_updates": 2}))
+    trainer.update(minibatch_of(trainer.config, 0))
+    theta = weights(trainer.online)
+    trainer.update(minibatch_of(trainer.config, 1, episodes=5))
+    assert trainer.state().copied == 5
+    assert torch.equal(weights(trainer.target), weights(trainer.online))
+    assert not torch.equal(weights(trainer.target), theta)
+
+
+@pytest.mark.parametrize(
+    "finished, copied, f, due",
+    [(4, 0, 5, False), (5, 0, 5, True), (6, 5, 5, False), (9, 5, 5, False), (10, 5, 5, True), (7, 0, 0, False)],
+)
+def test_copy_due(finished, copied, f, due):
+    assert copy_due(finished, copied, f) is due
+
+
+def test_the_target_starts_as_theta_and_takes_no_gradient(paper, trainer_of):
+    trainer = trainer_of(paper)
+    assert torch.equal(weights(trainer.online), weights(trainer.target))
+    assert not any(p.requires_grad for p in trainer.target.parameters())
+
+
+def test_the_loss_falls_on_a_fixed_problem(small, trainer_of, minibatch_of):
+    config = small({"dqn.learning_rate": 0.01})
+    trainer = trainer_of(config)
+    batch = minibatch_of(config, b=32, discount=np.zeros(32, "<f4"))
+    losses = [trainer.update(batch).loss for _ in range(300)]
+    assert losses[-1] < 0.02 * losses[0]
+
+
+def test_a_constant_reward_is_worth_its_geometric_sum(small, trainer_of, minibatch_of):
+    """The time limit is no terminal state: with r = 1 and gamma = 0.5 for ever, Q is 1 / (1 - gamma) = 2."""
+    config = small({"dqn.gamma": 0.5, "dqn.learning_rate": 0.003, "dqn.target_episodes": 0, "dqn.target_updates": 20})
+    trainer = trainer_of(config)
+    for n in range(600):
+        metrics = trainer.update(minibatch_of(config, n % 8, b=32, reward=np.ones(32, "<f4")))
+    assert metrics.q_mean == pytest.approx(2.0, abs=0.1)
+
+
+def test_same_minibatches_same_weights(preset, trainer_of, minibatch_of):
+    first, second = trainer_of(preset), trainer_of(preset)
+    for n in range(3):
+        assert first.update(minibatch_of(preset, n)) == second.update(minibatch_of(preset, n))
+    assert same(first, second)
+
+
+def test_a_loaded_state_goes_on_bit_for_bit(preset, trainer_of, minibatch_of):
+    config = build({"dqn.target_episodes": 5, "dqn.target_updates": 7}, preset)
+    trainer, other = trainer_of(config), trainer_of(build({"training.seed": 99}, config))
+    for n in range(8):
+        trainer.update(minibatch_of(config, n, episodes=n))
+    trainer.policy()
+    other.load(trainer.state())
+    assert same(trainer, other)
+    for n in range(8, 16):
+        assert trainer.update(minibatch_of(config, n, episodes=n)) == other.update(minibatch_of(config, n, episodes=n))
+    assert same(trainer, other)
+
+
+def test_a_state_is_a_copy(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small())
+    before = trainer.state()
+    held = {k: t.clone() for k, t in before.tensors.items()}
+    trainer.update(minibatch_of(trainer.config))
+    assert all(torch.equal(held[k], before.tensors[k]) for k in held)
+    assert all(t.is_contiguous() for t in before.tensors.values())
+
+
+def test_a_state_of_another_network_is_refused(small, trainer_of):
+    trainer = trainer_of(small())
+    before = trainer.state()
+    with pytest.raises(ValueError, match="another network"):
+        trainer.load(trainer_of(small({"network.dense": 9})).state())
+    assert all(torch.equal(t, before.tensors[k]) for k, t in trainer.state().tensors.items())
+
+
+def test_a_read_only_minibatch_off_the_wire_is_taken(small, trainer_of, minibatch_of):
+    config = small()
+    batch = minibatch_of(config)
+    fields = {k: v for k, v in vars(batch).items() if isinstance(v, np.ndarray)}
+    frozen = {k: np.frombuffer(v.tobytes(), v.dtype).reshape(v.shape) for k, v in fields.items()}
+    assert not frozen["observation"].flags.writeable
+    assert trainer_of(config).update(minibatch_of(config, **frozen)) == trainer_of(config).update(batch)
+
+
+@pytest.mark.parametrize(
+    "wrong, text",
+    [
+        ({"observation": np.zeros((6, 3, 8, 9), "<f4")}, r"shape \(6, 3, 8, 9\), the network needs \(6, 3, 9, 9\)"),
+        ({"next_observation": np.zeros((5, 3, 9, 9), "<f4")}, "the network needs"),
+        ({"reward": np.zeros(5, "<f4")}, "differ in length"),
+        ({"discount": np.zeros(7, "<f4")}, "differ in length"),
+        ({"allowed": np.ones((6, 8), "u1")}, "differ in length"),
+        ({"action": np.full(6, 9, "u1")}, "an action 9"),
+        ({"allowed": np.zeros((6, 9), "u1")}, "no allowed action"),
+        ({"reward": np.full(6, 3e38, "<f4")}, "diverged.*lower dqn.learning_rate"),
+    ],
+)
+def test_a_minibatch_that_does_not_fit_changes_nothing(small, trainer_of, minibatch_of, wrong, text):
+    trainer, untouched = trainer_of(small()), trainer_of(small())
+    with pytest.raises(TrainingError, match=text):
+        trainer.update(minibatch_of(trainer.config, **wrong))
+    assert same(trainer, untouched)
+
+
+def test_an_empty_minibatch_is_refused(small, trainer_of, minibatch_of):
+    with pytest.raises(TrainingError):
+        trainer_of(small()).update(minibatch_of(small(), b=0))
+
+
+def test_a_shape_that_the_settings_do_not_have_is_refused(paper):
+    with pytest.raises(ValueError, match="do not fit"):
+        Trainer(paper, (3, 30, 30), Grid(20, 30))
+
+
+def test_each_policy_has_a_newer_version_and_says_what_it_is(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small())
+    trainer.update(minibatch_of(trainer.config))
+    versions = [trainer.policy(), trainer.policy(), trainer.policy(after=40), trainer.policy(after=3)]
+    assert [v for v, _ in versions] == [1, 2, 41, 42]
+    session = onnxruntime.InferenceSession(versions[-1][1], providers=["CPUExecutionProvider"])
+    card = PolicyCard.from_json(session.get_modelmeta().custom_metadata_map[KEY])
+    assert card == card_for(trainer.config, trainer.grid, 42, 1)
+
+
+def test_metrics_are_plain_floats(small, trainer_of, minibatch_of):
+    metrics = trainer_of(small()).update(minibatch_of(small()))
+    assert all(type(v) is float and math.isfinite(v) for k, v in vars(metrics).items() if k != "updates")

@@ -1,0 +1,98 @@
+"""The TMC as a process: sockets and a clock around the station, one loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+from tmc.journal import Journal
+from tmc.station import LEARNER, Outbox, Station
+from tmc.wire import sockets
+from tmc.wire.codec import CodecError, decode
+from tmc.wire.messages import Bye, End
+
+BURST = 64
+"""Messages taken from one socket before the other has its turn."""
+FAREWELL = 60.0
+"""Seconds that the TMC waits for the last client to leave once the mission is over."""
+
+
+class Service:
+    """Binds both sockets, and serves until the mission is over or `stop` says so."""
+
+    def __init__(self, station: Station, journal: Journal, endpoint: str) -> None:
+        self.station, self.journal = station, journal
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.sync = sockets.router(self.context, endpoint)
+        self.feed = sockets.router(self.context, sockets.feed_endpoint(endpoint))
+        self._where: dict[str, tuple[zmq.Socket[Any], bytes]] = {}
+        self._here: set[str] = set()
+        self._over: float | None = None
+
+    def serve(self, stop: Callable[[], bool]) -> bool:
+        """The main loop. True when the mission came to its end, False when it was stopped."""
+        poller = zmq.Poller()
+        for sock in (self.sync, self.feed):
+            poller.register(sock, zmq.POLLIN)
+        while not stop():
+            for sock, _ in poller.poll(100):
+                self._drain(sock)
+            self.station.tick(time.monotonic())
+            self._post(self.station.out.take())
+            self.journal.writer.maybe_flush()
+            if self._finished():
+                return True
+        self._say_goodbye("the TMC was stopped")
+        return False
+
+    def _drain(self, sock: zmq.Socket[Any]) -> None:
+        for _ in range(BURST):
+            frames = sockets.receive(sock)
+            if frames is None:
+                return
+            self._take(sock, bytes(frames[0]), frames[1:])
+            self._post(self.station.out.take())
+
+    def _take(self, sock: zmq.Socket[Any], identity: bytes, frames: list[Any]) -> None:
+        sender = sockets.sender_name(identity)
+        self._where[sender] = (sock, identity)
+        try:
+            if len(frames) > sockets.PARTS:
+                raise CodecError("malformed", f"{len(frames)} frames, at most {sockets.PARTS} are taken")
+            message = decode(frames)
+        except CodecError as error:
+            self.station.reject(sender, error.code, str(error))
+            return
+        self._here.add(sender)
+        if isinstance(message, Bye):
+            self._here.discard(sender)
+        self.station.handle(sender, message, time.monotonic())
+
+    def _post(self, outbox: Outbox) -> None:
+        """Journal first, then send: what is not in the journal did not happen."""
+        self.journal.take(outbox)
+        for name, message in outbox.sends:
+            if name in self._where:
+                sock, identity = self._where[name]
+                sockets.send(sock, message, identity)
+
+    def _finished(self) -> bool:
+        """Over, and everybody has left or was given time to."""
+        if self.station.phase != "done":
+            return False
+        now = time.monotonic()
+        self._over = self._over or now
+        members = [name for name in self._here if name == LEARNER or name.startswith("uav-")]
+        return not members or now - self._over > FAREWELL
+
+    def _say_goodbye(self, reason: str) -> None:
+        for sock, identity in self._where.values():
+            sockets.send(sock, End(reason), identity)
+
+    def close(self) -> None:
+        """Close the sockets and the journal."""
+        self.context.destroy(linger=200)
+        self.journal.writer.close()
