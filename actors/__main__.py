@@ -28,10 +28,9 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
     service = Service(uav, endpoint, out)
     try:
         service.fly(stop)
-        return process.DONE
     except Left as left:
         service.say(messages.Bye("uav", uav, str(left)))
-        if left.code != process.DONE:
+        if left.code not in {process.DONE, process.STOPPED}:
             print(f"overfly: UAV {uav}: {left}", file=sys.stderr)
         return left.code
     finally:

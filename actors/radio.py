@@ -2,8 +2,8 @@
 
 Peer j, last known to be in c_j at tick s_j, was last told that this UAV was in c at tick s. By tick t the two can
 have come within reach only if `chebyshev(c_j, c) - |t - s_j| - (t - s) <= reach`; until then no beacon goes out. This
-mirrors the rule by which the peer waits (actors.airspace), so whoever waits is always told. Should a beacon be lost with a
-process, the one that waits asks.
+mirrors the rule by which the peer waits (actors.airspace), so whoever waits is always told. Should a beacon be lost with
+a process, the one that waits asks.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import zmq
 
@@ -56,8 +56,8 @@ class Service:
         self._said = time.monotonic()
         self._reported, self._status_due = (self._said, 0), 0.0
 
-    def fly(self, stop: Callable[[], bool]) -> None:
-        """The main loop; raises Left when the TMC ends it."""
+    def fly(self, stop: Callable[[], bool]) -> NoReturn:
+        """The main loop; raises Left when the TMC, or a signal, ends it."""
         self.pilot, self.radio = self._join(stop)
         pilot, naps = self.pilot, 0
         while not stop():
@@ -72,7 +72,7 @@ class Service:
                 self.say(record)
                 self._report(record)
             self._listen(0.1)
-        self.say(m.Bye("uav", self.uav, "stopped"))
+        raise Left(process.STOPPED, "stopped by a signal")
 
     def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
         """Say hello until the TMC answers, and build the pilot of the mission that it names."""
@@ -84,7 +84,7 @@ class Service:
                 if isinstance(message, m.Welcome):
                     return self._make_pilot(message)
                 self._obey(message)
-        raise Left(process.DONE, "stopped before the TMC answered")
+        raise Left(process.STOPPED, "stopped before the TMC answered")
 
     def _make_pilot(self, welcome: m.Welcome) -> tuple[Pilot, RadioTracks | None]:
         config = build(json.loads(welcome.config))

@@ -25,8 +25,7 @@ def learn(endpoint: str, out: Path) -> int:
     stop = process.Stop()
     service = Service(endpoint, out)
     try:
-        service.learn(stop)
-        return process.DONE
+        return process.DONE if service.learn(stop) else process.STOPPED
     finally:
         service.close()
 

@@ -59,8 +59,8 @@ class Trainer:
             raise ValueError(f"observations of shape {shape} do not fit these settings: {view_shape(config, grid)}")
         self.config, self.shape, self.grid = config, shape, grid
         self.updates = self.version = self.copied = 0
-        # Measured, b = 128, one thread: channels-last saves 6 % of an update of the paper's network (patrol: 2 %),
-        # the fused Adam 7 % (9 %).
+        # Channels-last and the fused Adam: measured, b = 128, one thread of a shared machine, medians of three runs, an
+        # update takes 19.4 instead of 25.9 ms (patrol: 8.2 instead of 10.0 ms); either alone gains less.
         self.online = channels_last(qnet.build(config, shape))
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = torch.optim.Adam(self.online.parameters(), lr=config.dqn.learning_rate, fused=True)

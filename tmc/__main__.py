@@ -30,10 +30,9 @@ def serve(config: Config, endpoint: str, out: Path, *, learning: bool, policy: P
     out.mkdir(parents=True, exist_ok=True)
     service = Service(station, Journal(out, world, run), endpoint)
     try:
-        service.serve(stop)
+        return process.DONE if service.serve(stop) else process.STOPPED
     finally:
         service.close()
-    return process.DONE
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmc.kernel.draws import Stream, uniforms
+from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Floats, Ints, Observer
 from tmc.kernel.world import World
 
@@ -141,6 +142,8 @@ class Replay:
         cells = team[batch, uav]
         sensed = self.observer.sensed(cells, team, uav)
         obs = self.observer.observe_batch(cells, team, sensed, self.belief(row, uav))
+        if not self.world.config.exploration.mask_blocked:
+            return obs, np.ones((row.size, N_ACTIONS), np.uint8)
         return obs, self.observer.allowed_batch(cells, team, sensed)
 
     def belief(self, row: Ints, uav: Ints) -> NDArray[np.float64]:

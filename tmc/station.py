@@ -20,6 +20,7 @@ from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.world import World
 from tmc.limiter import Limiter
+from tmc.record.channels import uav_topic
 from tmc.replay import Replay
 from tmc.wire import messages as m
 
@@ -199,7 +200,7 @@ class Station:
             self.reject(sender, "refused", str(refused))
             return
         member.sequence += 1
-        self.out.entries.append(Entry(f"/uav/{record.uav:03d}/record", {"record": record}))
+        self.out.entries.append(Entry(uav_topic(record.uav, "record"), {"record": record}))
         for exchange in flight.exchanges():
             self._answer(flight, exchange)
         self._journal_truth(flight, flight.settle())

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable
 from types import FrameType
 
-DONE, FAILED, USAGE, FENCED = 0, 1, 2, 75
-"""Exit codes: all well; a failed run; a user's mistake; replaced by a newer process of the same name."""
+DONE, FAILED, USAGE, FENCED, STOPPED = 0, 1, 2, 75, 143
+"""Exit codes: all well; failed; a user's mistake; replaced by a newer process of the same name; ended by a signal."""
 
 _PR_SET_PDEATHSIG = 1
 

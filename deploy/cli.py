@@ -1,0 +1,95 @@
+"""The command `overfly`: one table of subcommands. A module is imported only when its command is chosen."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import os
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from tmc.wire import process
+
+
+@dataclass(frozen=True)
+class Command:
+    """One row: its name, the module with `add_arguments(parser)` and `main(args) -> int`, and one line of help."""
+
+    name: str
+    module: str
+    about: str
+
+
+COMMANDS: tuple[Command, ...] = (
+    Command("run", "deploy.commands.run", "train: spawn TMC, learner and N UAVs, and look after them"),
+    Command("fly", "deploy.commands.fly", "fly a mission with a fixed policy or a planner, no learner"),
+    Command("evaluate", "deploy.commands.evaluate", "compare policies and planners over many seeds"),
+    Command("analyze", "deploy.commands.analyze", "a run's summary and pictures, from its log"),
+    Command("log", "deploy.commands.log", "read the log of a run: info, cat, moves, uncertainty, events, digest"),
+    Command("map", "deploy.commands.map", "the maps: list, show, export, check"),
+    Command("tmc", "deploy.commands.tmc", "the TMC alone, for roles started by hand or on other hosts"),
+    Command("actor", "deploy.commands.actor", "one UAV alone"),
+    Command("learner", "deploy.commands.learner", "the learner alone"),
+    Command("doctor", "deploy.commands.doctor", "check this machine, the install, and list the settings"),
+)
+
+
+def mistakes() -> tuple[type[Exception], ...]:
+    """The errors that are the user's to mend: one sentence and exit code 2."""
+    from tmc.kernel.config import ConfigError  # noqa: PLC0415  the command starts without NumPy
+    from tmc.kernel.policy import PolicyError  # noqa: PLC0415
+    from tmc.kernel.roadmap import MapError  # noqa: PLC0415
+    from tmc.record.errors import RecordError  # noqa: PLC0415
+    from tmc.wire.sockets import EndpointError  # noqa: PLC0415
+
+    return ConfigError, PolicyError, MapError, RecordError, EndpointError
+
+
+def parser_for(chosen: str | None) -> argparse.ArgumentParser:
+    """The parser; only the chosen command's module is imported for its options."""
+    parser = argparse.ArgumentParser("overfly", description="A team of UAV processes learns to patrol a road network.")
+    parser.add_argument("--version", action="version", version=f"overfly {version('overfly')}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in COMMANDS:
+        sub = commands.add_parser(command.name, help=command.about, description=command.about)
+        if command.name == chosen:
+            importlib.import_module(command.module).add_arguments(sub)
+    return parser
+
+
+def check_install() -> None:
+    """The four packages have plain names: make sure that they are ours, side by side in one folder."""
+    origins = [(importlib.util.find_spec(name), name) for name in ("actors", "learner", "tmc", "deploy")]
+    roots = {str(Path(spec.origin).resolve().parent.parent) if spec and spec.origin else f"no {name}"
+             for spec, name in origins}  # fmt: skip
+    if len(roots) > 1:
+        from tmc.kernel.config import ConfigError  # noqa: PLC0415
+
+        raise ConfigError(f"the packages of Overfly lie in different folders ({', '.join(sorted(roots))}): reinstall")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    chosen = next((a for a in argv if not a.startswith("-")), None)
+    args = parser_for(chosen).parse_args(argv)
+    module = importlib.import_module(next(c.module for c in COMMANDS if c.name == args.command))
+
+    def run() -> int:
+        check_install()
+        return int(module.main(args))
+
+    try:
+        return process.run(run, mistakes())
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

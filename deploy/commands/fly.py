@@ -1,0 +1,27 @@
+"""`overfly fly WHO`: a mission with a fixed policy or a planner in real processes; deterministic."""
+
+from __future__ import annotations
+
+import argparse
+
+from deploy import mission, settings, who
+from deploy.commands.analyze import report
+from deploy.commands.run import add_mission_options
+from tmc.kernel.config import build
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("who", help="policy file, run folder, or planner:random, planner:random-road, planner:greedy")
+    settings.add_options(parser)
+    add_mission_options(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
+    pilot = who.resolve(args.who)
+    values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+    config = build(values)
+    out = mission.new_folder(args.out, "fly")
+    code = mission.Mission(config, out, mission.command_line(), pilot.policy).run(in_one_process=args.lockstep)
+    return code or report(out, as_json=args.json)

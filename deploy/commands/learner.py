@@ -1,0 +1,20 @@
+"""`overfly learner`: the learner alone."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("--connect", default="tcp://127.0.0.1:5555", metavar="ENDPOINT", help="the TMC's endpoint")
+    parser.add_argument("--out", type=Path, default=Path("runs/learner"), metavar="DIR",
+                        help="folder for its log, checkpoints and policies")  # fmt: skip
+
+
+def main(args: argparse.Namespace) -> int:
+    """Learn until the TMC ends the mission."""
+    from learner.__main__ import learn  # noqa: PLC0415  torch is imported only when a learner is meant
+
+    return learn(args.connect, args.out)

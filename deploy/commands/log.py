@@ -1,0 +1,103 @@
+"""`overfly log ...`: what the log of a run holds, as text and CSV."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+
+from tmc.record import facts
+from tmc.record.errors import RecordError
+from tmc.record.reader import info, read, run_files
+
+VIEWS = ("info", "cat", "moves", "uncertainty", "events", "digest")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    views = parser.add_subparsers(dest="view", required=True, metavar="VIEW")
+    about = {
+        "info": "files, topics and counts",
+        "cat": "every message as a line of JSON",
+        "moves": "CSV tick,uav,cell; tick 0 is the start",
+        "uncertainty": "CSV tick,value: the sum over cells of the true map",
+        "events": "CSV tick,cell: events that appeared (scenario I)",
+        "digest": "the hash of all trajectories, the last word printed",
+    }
+    for view in VIEWS:
+        sub = views.add_parser(view, help=about[view], description=about[view])
+        sub.add_argument("run", type=Path, help="run folder" + (", or one MCAP file" if view in {"info", "cat"} else ""))
+        if view in {"moves", "uncertainty", "events"}:
+            sub.add_argument("--episode", type=int, default=1, metavar="E", help="from 1 (default: 1)")
+        if view == "info":
+            sub.add_argument("--json", action="store_true", help="print it as JSON")
+        if view == "cat":
+            sub.add_argument("--topic", action="append", metavar="TOPIC", help="only this topic; may be repeated")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print one view."""
+    return _MAINS[args.view](args)
+
+
+def _files(run: Path) -> dict[str, Path]:
+    return {run.name: run} if run.is_file() else run_files(run)
+
+
+def _info(args: argparse.Namespace) -> int:
+    rows = []
+    for process, path in _files(args.run).items():
+        found = info(path)
+        for name, topic in found.topics.items():
+            rows.append({"process": process, "topic": name, "schema": topic.schema, "messages": topic.count})
+        if found.damage:
+            print(f"overfly: {path}: {found.damage}", file=sys.stderr)
+        if not args.json:
+            print(f"{process}  {path}  {found.bytes:,} bytes  {_when(found.first)} to {_when(found.last)}")
+            for name, topic in found.topics.items():
+                print(f"  {topic.count:>9,}  {name:<24} {topic.schema}")
+    if args.json:
+        print(json.dumps(rows, indent=1))
+    return 0
+
+
+def _when(time_ns: int | None) -> str:
+    return "-" if time_ns is None else datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _cat(args: argparse.Namespace) -> int:
+    from google.protobuf.json_format import MessageToDict  # noqa: PLC0415  slow to import, used only here
+
+    for path in _files(args.run).values():
+        for entry in read(path, args.topic):
+            body = MessageToDict(entry.message, preserving_proto_field_name=True)
+            head = {"topic": entry.topic, "log_time": entry.log_time, "sequence": entry.sequence}
+            print(json.dumps(head | {"message": body}))
+    return 0
+
+
+def _csv(header: str, rows: Iterable[tuple[object, ...]]) -> int:
+    sys.stdout.write(header + "\n")
+    sys.stdout.writelines(",".join(map(repr, row)) + "\n" for row in rows)
+    return 0
+
+
+def _digest(args: argparse.Namespace) -> int:
+    episodes = facts.tracks(args.run)
+    if not episodes:
+        raise RecordError(f"{args.run} holds no flight record: nothing was flown")
+    print(f"{len(episodes)} episode(s) {facts.digest(args.run)}")
+    return 0
+
+
+_MAINS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "info": _info,
+    "cat": _cat,
+    "moves": lambda a: _csv("tick,uav,cell", facts.moves(a.run, a.episode)),
+    "uncertainty": lambda a: _csv("tick,value", facts.uncertainty(a.run, a.episode)),
+    "events": lambda a: _csv("tick,cell", facts.events(a.run, a.episode)),
+    "digest": _digest,
+}

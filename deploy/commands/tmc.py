@@ -1,0 +1,42 @@
+"""`overfly tmc PRESET`: the TMC alone; UAVs and the learner connect to it from this host or others."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from deploy import mission, settings, who
+from tmc.__main__ import serve
+from tmc.kernel.config import build, flat
+from tmc.wire.sockets import feed_endpoint
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("preset", nargs="?", default="paper", help="settings to start from (default: paper)")
+    parser.add_argument("--bind", default="tcp://127.0.0.1:5555", metavar="ENDPOINT",
+                        help="where the UAVs connect; the learner uses the next port (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--fly", metavar="WHO", help="fly a fixed policy or a planner; there is no learner")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder; runs/tmc-<time> when left out")
+    settings.add_options(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Serve until the mission is over."""
+    feed_endpoint(args.bind)
+    config = settings.config_for(args.preset, settings.chosen(args))
+    policy = None
+    if args.fly:
+        pilot = who.resolve(args.fly)
+        values = {**flat(config), **pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+        config, policy = build(values), pilot.policy
+    out = mission.new_folder(args.out, "tmc")
+    (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
+    path = None
+    if policy is not None:
+        path = out / "policies" / "flown.onnx"
+        path.parent.mkdir()
+        path.write_bytes(policy)
+    print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
+    return serve(config, args.bind, out, learning=not args.fly, policy=path, tracks="")

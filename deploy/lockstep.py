@@ -1,0 +1,122 @@
+"""The same mission in one process: the station, the pilots and, where there is one, the trainer take turns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from actors.fleet import Fleet
+from actors.pilot import Pilot
+from actors.planners import PREFIX, Decider, PlannerDecider
+from actors.tracks import TableTracks, TrackTable
+from deploy.progress import Progress
+from tmc.journal import Journal
+from tmc.kernel.observation import Observer
+from tmc.kernel.world import World
+from tmc.station import LEARNER, Outbox, Station, uav_name
+from tmc.wire import messages as m
+
+if TYPE_CHECKING:
+    from learner.trainer import Trainer
+
+
+class LockStep:
+    """A mission without sockets. `keep` gets every outbox of the station before its messages are delivered."""
+
+    def __init__(
+        self, world: World, policy: bytes | None, keep: Callable[[Outbox], None], trainer: Trainer | None = None
+    ) -> None:
+        config = world.config
+        self.world, self.keep, self.trainer = world, keep, trainer
+        self.station = Station(world, "lockstep", learning=trainer is not None, policy=policy)
+        observer = self.station.observer
+        table = TrackTable(config.team.size, config.training.ticks)
+        planner = PlannerDecider(world, config.team.pilot) if config.team.pilot.startswith(PREFIX) else None
+        decider = _decider_maker(world, observer)
+        pilots = [
+            Pilot(world, i, 1, TableTracks(table, i), observer, decider, planner) for i in range(config.team.size)
+        ]
+        self.fleet = Fleet(pilots, self._exchange)
+        self._minibatches: list[m.Minibatch] = []
+
+    def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
+        self.station.handle(uav_name(uav), message, 0.0)
+        return self._take()
+
+    def _take(self) -> list[tuple[int, m.Message]]:
+        outbox = self.station.out.take()
+        self.keep(outbox)
+        self._minibatches += [x for to, x in outbox.sends if to == LEARNER and isinstance(x, m.Minibatch)]
+        return [(int(to.removeprefix("uav-")), x) for to, x in outbox.sends if to.startswith("uav-")]
+
+    def _tell(self, message: m.Message) -> None:
+        """The learner says something; what the station has for the UAVs is delivered."""
+        self.station.handle(LEARNER, message, 0.0)
+        for uav, reply in self._take():
+            self.fleet.deliver(uav, reply)
+
+    def run(self, show: Callable[[m.Status], None] | None = None) -> None:
+        """Fly all episodes."""
+        if self.trainer is not None:
+            self._tell(m.Hello("learner", -1, 1))
+            self._push()
+            self._tell(m.SampleRequest(0))
+        for pilot in self.fleet.pilots:
+            for uav, reply in self._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
+                self.fleet.deliver(uav, reply)
+        while self.fleet.step() | self._learn():
+            if show is not None:
+                show(self.station.status())
+
+    def _learn(self) -> bool:
+        """Train on every minibatch that the limiter lets through; True when there was one."""
+        trainer, learned = self.trainer, False
+        while trainer is not None and self._minibatches:
+            metrics = trainer.update(self._minibatches.pop(0))
+            learned = True
+            if metrics.updates % self.world.config.training.push_every == 0:
+                self._push(metrics.loss)
+            self._tell(m.SampleRequest(metrics.updates))
+        return learned
+
+    def _push(self, loss: float = 0.0) -> None:
+        assert self.trainer is not None
+        version, model = self.trainer.policy()
+        self._tell(m.PolicyPush(version, self.trainer.updates, loss, model))
+
+
+def _decider_maker(world: World, observer: Observer) -> Callable[[bytes], Decider]:
+    """UAVs in one process share the session of a policy file; it holds no state of theirs."""
+    made: dict[bytes, Decider] = {}
+
+    def make(model: bytes) -> Decider:
+        from actors.policy import NetworkDecider  # noqa: PLC0415  planners fly without ONNX Runtime
+
+        if model not in made:
+            made.clear()
+            made[model] = NetworkDecider(model, world.config, observer)
+        return made[model]
+
+    return make
+
+
+def run(world: World, out: Path, policy: Path | None, progress: Progress) -> None:
+    """Fly a mission in this process, with the same log as the TMC process writes."""
+    config = world.config
+    trainer = None
+    if policy is None and config.team.pilot == "policy":
+        from learner.trainer import Trainer  # noqa: PLC0415  torch only where something is learned
+        from tmc.kernel.policy import view_shape  # noqa: PLC0415
+
+        trainer = Trainer(config, view_shape(config, world.grid), world.grid)
+    journal = Journal(out, world, "lockstep")
+    try:
+        mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer)
+        mission.run(progress.show)
+        if trainer is not None:
+            from learner.service import write_policy  # noqa: PLC0415
+
+            write_policy(out / "policies" / "final.onnx", trainer.policy()[1])
+    finally:
+        journal.writer.close()

@@ -1,0 +1,127 @@
+"""A mission from its config to its run folder: processes or lock step, then the summary and the pictures."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import sys
+import time
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from actors.tracks import create_table
+from deploy import lockstep, plan, who
+from deploy.progress import Observer, Progress
+from deploy.supervisor import MissionFailed, Supervisor
+from tmc.kernel.config import Config, ConfigError, flat
+from tmc.kernel.uncertainty import lower_bound
+from tmc.kernel.world import World
+from tmc.wire import process
+
+POLL = 0.1
+"""Seconds between two looks at the processes."""
+
+
+def new_folder(out: Path | None, name: str) -> Path:
+    """The run folder, which must not hold anything yet; by default `runs/<name>-<time>`."""
+    if out is None:
+        stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+        out = Path("runs") / f"{name}-{stamp}"
+        for n in range(2, 1000):
+            if not out.exists():
+                break
+            out = Path("runs") / f"{name}-{stamp}-{n}"
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out} exists and is not empty: choose another --out, or remove it")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the run folder {out}: {error.strerror}; choose another --out") from None
+    return out
+
+
+def bound_of(world: World) -> float:
+    """What no team can beat: the lower bound of eq. (6) in scenario II from a visited map, otherwise 0 (unknown)."""
+    config = world.config
+    if config.scenario != 2 or config.world.initial_map != "visited":
+        return 0.0
+    return lower_bound(world.alpha, config.team.size, config.training.ticks)
+
+
+class Mission:
+    """One mission in its run folder."""
+
+    def __init__(self, config: Config, out: Path, command: str, policy: bytes | None = None) -> None:
+        self.world = World(config)
+        self.config, self.out, self.command = config, out, command
+        self.policy: Path | None = None
+        if policy is not None:
+            who.require_policy(policy, self.world)
+            self.policy = out / "policies" / "flown.onnx"
+            self.policy.parent.mkdir(parents=True, exist_ok=True)
+            self.policy.write_bytes(policy)
+        (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
+        self.progress = Progress(config, self.world.law.cells.size, bound_of(self.world))
+        self._start = time.time()
+        self._write_run({})
+
+    def run(self, *, in_one_process: bool) -> int:
+        """Fly it; returns the exit code. What it left is in the run folder either way."""
+        try:
+            if in_one_process:
+                lockstep.run(self.world, self.out, self.policy, self.progress)
+            else:
+                self._fly()
+        except MissionFailed as failed:
+            self.progress.note(str(failed))
+            return process.FAILED
+        except KeyboardInterrupt:
+            self.progress.note(f"stopped; what was flown is in {self.out}")
+            return 130
+        finally:
+            self.progress.clear()
+        return process.DONE
+
+    def _fly(self) -> None:
+        mission = plan.make(self.config, self.out, policy=self.policy)
+        supervisor = Supervisor(mission, self.out, self.config.training.threads, self.progress.note)
+        observer = Observer(mission.endpoint)
+        try:
+            create_table(mission.tracks, self.config.team.size, self.config.training.ticks)
+            supervisor.start()
+            while not supervisor.watch():
+                time.sleep(POLL)
+                status = observer.ask()
+                if status is not None:
+                    self.progress.show(status)
+            supervisor.wait(15.0)
+        finally:
+            observer.close()
+            supervisor.stop()
+            supervisor.close()
+            self._write_run({"exit_codes": supervisor.exit_codes(), "restarts": supervisor.restarts()})
+
+    def _write_run(self, more: dict[str, Any]) -> None:
+        """`run.json`: what was run, with which versions, and how each process ended."""
+        facts = {
+            "command": self.command,
+            "overfly": version("overfly"),
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "started": datetime.fromtimestamp(self._start, UTC).isoformat(timespec="seconds"),
+            "seconds": round(time.time() - self._start, 1),
+        }
+        (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
+
+
+def discard(out: Path) -> None:
+    """Remove a run folder in which nothing was flown."""
+    shutil.rmtree(out, ignore_errors=True)
+
+
+def command_line() -> str:
+    """The command as the user typed it."""
+    return " ".join(["overfly", *sys.argv[1:]])

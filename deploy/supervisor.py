@@ -1,0 +1,137 @@
+"""Starts the processes of a plan, starts crashed ones again with back-off, and ends them all in order."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from deploy import plan as plans
+from tmc.wire import process
+
+BACKOFF = (0.1, 5.0)
+"""Seconds before a crashed process is started again: the first time, and at most; doubles in between."""
+STEADY = 10.0
+"""Seconds up after which a crash counts as the first again."""
+TRIES = 6
+"""Crashes in a row after which the run is given up."""
+GRACE = 15.0
+"""Seconds that processes get to leave before they are killed."""
+FINAL = {process.USAGE, process.FENCED, 78}
+"""Exit codes after which a process is not started again."""
+
+
+class MissionFailed(Exception):  # noqa: N818  the sentence for the user
+    """A process failed for good: which one, how, and where its output is."""
+
+
+@dataclass
+class _Running:
+    child: plans.Child
+    popen: subprocess.Popen[bytes] | None = None
+    started: float = 0.0
+    crashes: int = 0
+    restarts: int = 0
+    again_at: float = 0.0
+
+
+class Supervisor:
+    """Runs a plan; `say` takes one-line notes for the user."""
+
+    def __init__(self, plan: plans.Plan, out: Path, threads: int, say: Callable[[str], None]) -> None:
+        self.plan, self.out, self.threads, self.say = plan, out, threads, say
+        self.running = [_Running(child) for child in plan.children]
+
+    def start(self) -> None:
+        """Start everybody."""
+        (self.out / "logs").mkdir(exist_ok=True)
+        for running in self.running:
+            self._start(running)
+
+    def log_of(self, name: str) -> Path:
+        """Where a process's own output goes."""
+        return self.out / "logs" / f"{name}.txt"
+
+    def _start(self, running: _Running) -> None:
+        child = running.child
+        threads = self.threads if child.name == "learner" else 1
+        with self.log_of(child.name).open("ab") as output:
+            running.popen = subprocess.Popen(
+                child.command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=plans.environment(child.name, threads),
+                start_new_session=True,  # Ctrl-C in the terminal is for the supervisor, who ends all in order
+            )
+        running.started = time.monotonic()
+
+    def watch(self) -> bool:
+        """Look after the processes once; True when the mission is over. Raises MissionFailed."""
+        for running in self.running:
+            if running.popen is None:
+                if time.monotonic() >= running.again_at:
+                    self._start(running)
+                continue
+            code = running.popen.poll()
+            if code == 0 and running.child.leads:
+                return True
+            if code:
+                self._crashed(running, code)
+        return False
+
+    def _crashed(self, running: _Running, code: int) -> None:
+        child, up = running.child, time.monotonic() - running.started
+        running.crashes = 1 if up > STEADY else running.crashes + 1
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        log = self.log_of(child.name)
+        if not child.restart or code in FINAL or running.crashes >= TRIES:
+            raise MissionFailed(f"{child.name} {how}{self._reason(log)}; its output is in {log}")
+        delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1])
+        running.popen, running.again_at = None, time.monotonic() + delay
+        running.restarts += 1
+        self.say(f"{child.name} {how}; it is started again (log: {log})")
+
+    @staticmethod
+    def _reason(log: Path) -> str:
+        """The last line that a process left, when it is one of our sentences."""
+        lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+        return f": {lines[-1].removeprefix('overfly: ')[:300]}" if lines and lines[-1].startswith("overfly:") else ""
+
+    def stop(self) -> None:
+        """Ask everybody to leave, UAVs first and the TMC last; kill who does not."""
+        for running in reversed(self.running):
+            if running.popen is not None and running.popen.poll() is None:
+                running.popen.terminate()
+        self.wait(GRACE)
+
+    def wait(self, patience: float) -> None:
+        """Wait for everybody to leave; kill who has not after `patience` seconds."""
+        until = time.monotonic() + patience
+        for running in self.running:
+            if running.popen is None:
+                continue
+            try:
+                running.popen.wait(max(0.0, until - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                self.say(f"{running.child.name} did not leave in {patience:g} s and is killed")
+                running.popen.kill()
+                running.popen.wait()
+
+    def exit_codes(self) -> dict[str, int | None]:
+        """The last exit code of each process, None where it never ended."""
+        return {r.child.name: None if r.popen is None else r.popen.returncode for r in self.running}
+
+    def restarts(self) -> dict[str, int]:
+        """How often each process was started again."""
+        return {r.child.name: r.restarts for r in self.running if r.restarts}
+
+    def close(self) -> None:
+        """Remove what the processes shared."""
+        with contextlib.suppress(OSError):
+            shutil.rmtree(self.plan.scratch)
