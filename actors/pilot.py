@@ -66,7 +66,7 @@ class Pilot:
         self.reward = RewardLaw(self.config, world.law.q)
         self.decider, self._make_decider, self._planner = planner, make_decider, planner
         self.phase = Phase.IDLE
-        self.episode = self.t = self.cell = self.sequence = self.version = 0
+        self.episode = self.t = self.cell = self.previous = self.sequence = self.version = 0
         self.policy = self.wanted = 0
         self.explored = self.steps = 0
         self.pending: Record | None = None
@@ -77,7 +77,7 @@ class Pilot:
         """Start an episode, or take a flight up again where the TMC's last record of it ends."""
         if self.phase is not Phase.IDLE and begin.episode == self.episode:
             return None  # a repeat
-        self.episode, self.t, self.cell = begin.episode, begin.tick, begin.cell
+        self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, begin.cell, begin.previous
         self.sequence, self.version = begin.sequence, begin.version
         self.airspace.begin(self.episode, self.world.starts(self.episode))
         self._epsilon = self.config.epsilon(self.episode)
@@ -174,7 +174,8 @@ class Pilot:
     def sight(self) -> Sight:
         """What this UAV knows at t."""
         allowed = self.observer.allowed(self.cell, self.peers)
-        return Sight(self.t, self.cell, self.peers, self.map_of(self.t), allowed, float(self._draws[self.t, 1]))
+        draw = float(self._draws[self.t, 1])
+        return Sight(self.t, self.cell, self.previous, self.peers, self.map_of(self.t), allowed, draw)
 
     def _act(self) -> None:
         """Choose a(t), epsilon-greedy; at the end of the episode there is nothing left to do."""
@@ -200,7 +201,7 @@ class Pilot:
         u = self._before_visit(k, cell) if k >= 0 else 0.0
         self.leg.rewards.append(self.reward(bool(block), cell not in self.visited, k, u))
         self.visited.add(cell)
-        self.t, self.cell = self.t + 1, cell
+        self.t, self.cell, self.previous = self.t + 1, cell, self.cell
         self.airspace.tracks.publish(self.t, cell)
         self.leg.cells.append(cell)
         self.leg.actions.append(self.action)

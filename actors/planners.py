@@ -15,11 +15,12 @@ from tmc.kernel.world import World
 
 @dataclass(frozen=True)
 class Sight:
-    """What a UAV knows when it decides: its cell, the cells of sensed peers, its map `u` (R,), the moves that nothing
-    known blocks, and one draw in [0, 1) of its own."""
+    """What a UAV knows when it decides: its cell and the one before, the cells of sensed peers, its map `u` (R,), the
+    moves that nothing known blocks, and one draw in [0, 1) of its own."""
 
     tick: int
     cell: int
+    previous: int
     peers: list[int]
     u: NDArray[np.float64]
     allowed: list[int]
@@ -46,8 +47,11 @@ def random(_world: World, sight: Sight) -> int:
 
 
 def random_road(world: World, sight: Sight) -> int:
-    """A random move along the road; off the road, a move that brings the UAV nearer to it."""
-    return _nearest_to_road(world, sight, [a for a in sight.allowed if a != STAY] or [STAY])
+    """A random move along the road that does not turn back unless it must; off the road, a move nearer to it."""
+    targets = world.grid.target_lists[sight.cell]
+    onward = [a for a in sight.allowed if a != STAY and targets[a] != sight.previous]
+    road = [a for a in onward if world.map.road[targets[a]]]
+    return _nearest_to_road(world, sight, road or [a for a in sight.allowed if a != STAY] or [STAY])
 
 
 def greedy(world: World, sight: Sight) -> int:

@@ -106,10 +106,9 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
     config = world.config
     trainer = None
     if policy is None and config.team.pilot == "policy":
-        from learner.trainer import Trainer  # noqa: PLC0415  torch only where something is learned
-        from tmc.kernel.policy import view_shape  # noqa: PLC0415
+        from learner.trainer import start  # noqa: PLC0415  torch only where something is learned
 
-        trainer = Trainer(config, view_shape(config, world.grid), world.grid)
+        trainer = start(config, world.grid)
     journal = Journal(out, world, "lockstep")
     try:
         mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer)

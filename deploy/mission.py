@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import shutil
 import sys
 import time
 from datetime import UTC, datetime
@@ -17,6 +16,7 @@ from deploy import lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
 from tmc.kernel.config import Config, ConfigError, flat
+from tmc.kernel.policy import check_view, view_shape
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
 from tmc.wire import process
@@ -51,15 +51,24 @@ def bound_of(world: World) -> float:
     return lower_bound(world.alpha, config.team.size, config.training.ticks)
 
 
-class Mission:
-    """One mission in its run folder."""
+def check(config: Config, policy: bytes | None = None) -> World:
+    """The world of a mission, once everything that can be wrong with its settings has been looked at."""
+    world = World(config)
+    if policy is not None:
+        who.require_policy(policy, world)
+    elif not who.is_planner(config):
+        check_view(config, view_shape(config, world.grid))
+    return world
 
-    def __init__(self, config: Config, out: Path, command: str, policy: bytes | None = None) -> None:
-        self.world = World(config)
-        self.config, self.out, self.command = config, out, command
+
+class Mission:
+    """One mission in its run folder; `world` comes from `check`."""
+
+    def __init__(self, world: World, out: Path, command: str, policy: bytes | None = None) -> None:
+        config = world.config
+        self.world, self.config, self.out, self.command = world, config, out, command
         self.policy: Path | None = None
         if policy is not None:
-            who.require_policy(policy, self.world)
             self.policy = out / "policies" / "flown.onnx"
             self.policy.parent.mkdir(parents=True, exist_ok=True)
             self.policy.write_bytes(policy)
@@ -115,11 +124,6 @@ class Mission:
             "seconds": round(time.time() - self._start, 1),
         }
         (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
-
-
-def discard(out: Path) -> None:
-    """Remove a run folder in which nothing was flown."""
-    shutil.rmtree(out, ignore_errors=True)
 
 
 def command_line() -> str:

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from tmc.kernel import draws
-from tmc.kernel.config import Config, ConfigError, Network
+from tmc.kernel.config import Config, Network
 from tmc.kernel.draws import Stream
 from tmc.kernel.grid import N_ACTIONS
+from tmc.kernel.policy import check_view, features
 
 Shape = tuple[int, int, int]
 """(channels, height, width) of an observation, eq. (10)."""
@@ -62,32 +63,14 @@ def crop_size(near: int) -> int:
     return (2 * near + 1) ** 2 if near else 0
 
 
-def features(network: Network, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns after the last convolution (no padding); raises ConfigError when nothing would be left."""
-    rows, cols = height, width
-    for _ in network.channels:
-        if min(rows, cols) < network.kernel:
-            raise ConfigError(
-                f"a view of {height} x {width} cells is too small for {len(network.channels)} convolutions with "
-                f"network.kernel = {network.kernel} and network.stride = {network.stride}: lower these, "
-                "or raise observation.radius"
-            )
-        rows, cols = ((n - network.kernel) // network.stride + 1 for n in (rows, cols))
-    return rows, cols
-
-
 def build(config: Config, shape: Shape) -> QNet:
     """The network for observations of this shape, with the initial weights of config.training.seed.
 
     Same seed, same weights, on any machine and torch version. Raises ConfigError for a view too small for the network.
     """
-    near = config.observation.near
-    if 2 * near + 1 > min(shape[1:]):
-        raise ConfigError(
-            f"observation.near = {near} is larger than the view: choose {(min(shape[1:]) - 1) // 2} or less"
-        )
+    check_view(config, shape)
     with torch.device("meta"):  # makes no weights yet, so that torch's hidden global generator is left alone
-        net = QNet(config.network, shape, near)
+        net = QNet(config.network, shape, config.observation.near)
     net.to_empty(device="cpu")
     initialise(net, config.training.seed)
     return net

@@ -9,13 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
 import zmq
 
 from learner import checkpoint
-from learner.trainer import Trainer, UpdateMetrics
+from learner.trainer import UpdateMetrics, start
 from tmc.kernel.config import build
-from tmc.kernel.policy import view_shape
 from tmc.kernel.world import World
 from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
@@ -75,10 +73,8 @@ class Service:
 
     def _prepare(self, welcome: m.Welcome) -> None:
         config = build(json.loads(welcome.config))
-        torch.set_num_threads(config.training.threads)
-        world = World(config)
         self.config = config
-        self.trainer = Trainer(config, view_shape(config, world.grid), world.grid)
+        self.trainer = start(config, World(config).grid)
         self.out.mkdir(parents=True, exist_ok=True)
         self.log = LogWriter(self.out / "learner.mcap", "learner", config.journal, {"run": welcome.run}, resume=True)
         saved = checkpoint.newest(self.out / "checkpoints")
@@ -91,10 +87,10 @@ class Service:
 
     def _listen(self) -> list[m.Message]:
         """What has come in; the time spent waiting for it is the learner's idle time."""
-        start = time.monotonic()
+        since = time.monotonic()
         if not self.sock.poll(int(SILENCE * 1000)):
             sockets.send(self.sock, m.Hello("learner", -1, self.life, self.trainer.updates))
-        self._idle += time.monotonic() - start
+        self._idle += time.monotonic() - since
         message = self._receive()
         return [] if message is None else [message]
 

@@ -156,6 +156,12 @@ def copy_due(finished: int, copied: int, f: int) -> bool:
     return f > 0 and finished // f > copied // f
 
 
+def start(config: Config, grid: Grid) -> Trainer:
+    """A trainer on as many threads as the settings say."""
+    torch.set_num_threads(config.training.threads)
+    return Trainer(config, view_shape(config, grid), grid)
+
+
 def channels_last(net: QNet) -> QNet:
     """The same network, its filters laid out in memory with the channels last."""
     for p in net.convs.parameters():

@@ -16,7 +16,7 @@ from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge, step_events
 from tmc.kernel.world import World
 from tmc.replay import Replay
-from tmc.wire.messages import EMPTY, Map, Record
+from tmc.wire.messages import EMPTY, Record
 
 
 class RefusedError(ValueError):
@@ -35,12 +35,17 @@ class Truth:
 
 @dataclass(frozen=True)
 class Exchange:
-    """The exchange at `tick`: the UAVs that are answered, and the version of the map that they get."""
+    """The exchange at `tick`: the UAVs that are answered, and the map that they get, as it was at that tick.
+
+    `last_visit` (R,) u16 in scenario II, `active` u16 cells in scenario I; `believed`: its uncertainty, summed.
+    """
 
     tick: int
     version: int
     uavs: list[int]
     believed: float
+    last_visit: NDArray[np.uint16]
+    active: NDArray[np.uint16]
 
 
 class Flight:
@@ -133,7 +138,7 @@ class Flight:
             raise RefusedError(f"record of UAV {r.uav} jumps: a cell does not follow from the action before it")
 
     def exchanges(self) -> list[Exchange]:
-        """Run the exchange clock as far as the records allow; each exchange is to be answered with `answer`."""
+        """Run the exchange clock as far as the records allow; one entry for each that could be held."""
         done = []
         while self.next_exchange <= self.T:
             t = self.next_exchange
@@ -151,7 +156,8 @@ class Flight:
             self._settle(t)
             frame = self.replay.add_frame(t, self.active[self.world.law.cells])
             self.base[t:, :] = frame
-            return Exchange(t, self.version, due, float(self.active.sum()))
+            active = np.flatnonzero(self.active).astype("<u2")
+            return Exchange(t, self.version, due, float(active.size), EMPTY, active)
         for i in due:
             self._apply_visits(i, t)
         numbers: dict[bytes, int] = {}
@@ -161,7 +167,8 @@ class Flight:
             if key not in numbers:
                 numbers[key] = self.replay.add_frame(t, self.beliefs[i])
             self.base[t:, i] = numbers[key]
-        return Exchange(t, self.version, due, float(self.uncertainty(self.believed, t).sum()))
+        believed = float(self.uncertainty(self.believed, t).sum())
+        return Exchange(t, self.version, due, believed, self.believed.copy(), EMPTY)
 
     def _apply_visits(self, i: int, t: int) -> None:
         """UAV i's visits up to t, all reported by now, into the map that the TMC believes."""
@@ -173,12 +180,6 @@ class Flight:
     def uncertainty(self, last_visit: NDArray[np.uint16], t: int) -> NDArray[np.float64]:
         """u_k(t) over the monitored cells, scenario II."""
         return self.world.law.values(last_visit, t, self.factor)
-
-    def answer(self, exchange: Exchange, policy: int, sequence: int) -> Map:
-        """The TMC's answer to every UAV that is due at an exchange."""
-        active = np.flatnonzero(self.active).astype("<u2") if self.scenario == 1 else EMPTY
-        last_visit = self.believed.copy() if self.scenario == 2 else EMPTY
-        return Map(self.episode, exchange.tick, exchange.version, policy, sequence, last_visit, active)
 
     def settle(self) -> Truth:
         """Run the truth clock up to the slowest UAV; returns what became final since the last call."""

@@ -82,7 +82,8 @@ class Station:
         self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
         self.roster = [Member() for _ in range(config.team.size)]
         self.flight: Flight | None = None
-        self.version = self.ticks = self.episodes = self.rejected = self.blocked = 0
+        self.version = self.ticks = self.episodes = self.rejected = 0
+        self.blocked = self.blocked_by_uav = 0
         self.uncertainty = self.episode_uncertainty = self.loss = 0.0
         self.policy_version = 0
         self.policies: dict[int, bytes] = {}
@@ -217,9 +218,12 @@ class Station:
         }  # fmt: skip
         self.out.entries.append(Entry("/tmc/sync", values))
         if flight.scenario == 2:
-            self.out.entries.append(Entry("/tmc/last_visit", {"last_visit": self._whole(flight.believed)}))
+            self.out.entries.append(Entry("/tmc/last_visit", {"last_visit": self._whole(exchange.last_visit)}))
         for i in exchange.uavs:
-            answer = flight.answer(exchange, self.policy_version, self.roster[i].sequence - 1)
+            answer = m.Map(
+                flight.episode, exchange.tick, exchange.version, self.policy_version, self.roster[i].sequence - 1,
+                exchange.last_visit, exchange.active,
+            )  # fmt: skip
             self._held.append((uav_name(i), answer))
 
     def _whole(self, last_visit: np.ndarray[Any, np.dtype[np.uint16]]) -> np.ndarray[Any, np.dtype[np.uint32]]:
@@ -270,8 +274,8 @@ class Station:
         tick = max(shipped, 0)
         visited = np.unique(flight.cells[: tick + 1, i]).astype("<u2")
         return m.Begin(
-            flight.episode, tick, int(flight.cells[tick, i]), shipped, self.roster[i].sequence, flight.version,
-            self.policy_version, flight.beliefs[i].copy(), visited, m.EMPTY,
+            flight.episode, tick, int(flight.cells[tick, i]), int(flight.cells[max(tick - 1, 0), i]), shipped,
+            self.roster[i].sequence, flight.version, self.policy_version, flight.beliefs[i].copy(), visited,
         )  # fmt: skip
 
     def _resume(self, i: int) -> None:
@@ -284,6 +288,7 @@ class Station:
     def _end_episode(self, flight: Flight) -> None:
         self.episodes = flight.episode
         self.blocked += sum(flight.blocked.values())
+        self.blocked_by_uav += flight.blocked[Block.UAV]
         self.episode_uncertainty = flight.total_uncertainty / flight.T
         self._journal_episode(flight, "end")
         self.flight = None

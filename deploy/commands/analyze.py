@@ -3,21 +3,88 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Mapping
 from pathlib import Path
+
+from tmc.analysis import report as reports
+from tmc.analysis.flown import Flown, read
+from tmc.analysis.metrics import summarize
+from tmc.analysis.summary import Summary
+from tmc.kernel.config import ConfigError
+from tmc.record.errors import RecordError
+
+NO_MATPLOTLIB = "no pictures, as matplotlib is not installed: pip install 'overfly[figures]'"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.add_argument("--episode", type=int, metavar="E", help="of the path picture (default: the last whole one)")
+    parser.add_argument("--no-pictures", action="store_true", help="make none")
+    parser.add_argument("--baseline", action="append", default=[], metavar="NAME=VALUE",
+                        help="dashed line in curves of training, by road cell; may be repeated")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
     """Read the log and say what it holds."""
-    return report(args.run, as_json=args.json)
+    return report(
+        args.run,
+        as_json=args.json,
+        episode=args.episode,
+        pictures=not args.no_pictures,
+        baselines=baselines(args.baseline),
+    )
 
 
-def report(run: Path, *, as_json: bool) -> int:
-    """placeholder until analysis lands"""
-    print(run)
+def baselines(options: list[str]) -> dict[str, float]:
+    """{name: uncertainty a road cell} of `NAME=VALUE` options."""
+    found = {}
+    for option in options:
+        name, _, value = option.rpartition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise ConfigError(f"--baseline {option} is no NAME=VALUE: write for example greedy=0.39")
+    return found
+
+
+def report(
+    run: Path,
+    *,
+    as_json: bool,
+    episode: int | None = None,
+    pictures: bool = True,
+    baselines: Mapping[str, float] | None = None,
+) -> int:
+    """Write RUN/summary.json and RUN/report/*.png, and print the summary; RecordError when RUN holds no flight."""
+    flown = read(run)
+    summary = summarize(flown)
+    if episode is not None:
+        flown.episode(episode)
+    _write(run / "summary.json", summary.to_json() + "\n")
+    made = _draw(flown, summary, episode, baselines or {}) if pictures else []
+    print(summary.to_json() if as_json else reports.text(summary, made))
     return 0
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, "utf-8")
+    except OSError as error:
+        raise RecordError(f"{path} cannot be written ({error.strerror}): make the run folder writable") from None
+
+
+def _draw(flown: Flown, summary: Summary, episode: int | None, lines: Mapping[str, float]) -> list[Path]:
+    """The pictures; none, and a sentence on stderr, without matplotlib."""
+    try:
+        from tmc.analysis import figures  # noqa: PLC0415  half a second, and an extra
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "matplotlib":
+            raise
+        print(f"overfly: {NO_MATPLOTLIB}", file=sys.stderr)
+        return []
+    return figures.draw(flown, summary, episode, lines)

@@ -1,4 +1,108 @@
-def add_arguments(parser):
-    pass
-def main(args):
+"""`overfly doctor`: is everything here that a run needs? Also the table of all settings."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from deploy import settings
+from tmc.kernel.config import SETTINGS, flat
+from tmc.kernel.world import World
+
+PACKAGES: tuple[tuple[str, str, str], ...] = (
+    ("numpy", "", "arithmetic of the world"),
+    ("pyzmq", "", "sockets"),
+    ("msgpack", "", "messages"),
+    ("mcap", "", "logs"),
+    ("protobuf", "", "logs"),
+    ("foxglove-schemas-protobuf", "", "logs that viewers know"),
+    ("onnxruntime", "", "policies in the UAVs"),
+    ("torch", "learner", "training"),
+    ("onnx", "learner", "policy files"),
+    ("safetensors", "learner", "checkpoints"),
+    ("matplotlib", "figures", "pictures"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("--settings", action="store_true", help="list every setting with its default and source")
+    parser.add_argument("--preset", default="paper", help="the preset whose values are listed (default: paper)")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Check, a line each; exit code 1 when something that every run needs is wrong."""
+    if args.settings:
+        return _settings(args.preset)
+    fine = True
+    for name, extra, purpose in PACKAGES:
+        fine &= _package(name, extra, purpose)
+    for what, look in CHECKS.items():
+        try:
+            print(f"  ok    {what}: {look()}")
+        except Exception as error:  # whatever is wrong here is what the doctor is for
+            fine = False
+            print(f"  BAD   {what}: {error}")
+    print("all is well" if fine else "something is wrong: see the lines with BAD")
+    return 0 if fine else 1
+
+
+def _package(name: str, extra: str, purpose: str) -> bool:
+    try:
+        print(f"  ok    {name} {version(name)}: {purpose}")
+    except PackageNotFoundError:
+        mend = f"pip install 'overfly[{extra}]'" if extra else "pip install overfly"
+        print(f"  {'none' if extra else 'BAD '}  {name}: needed for {purpose}; {mend}")
+        return bool(extra)
+    return True
+
+
+def _world() -> str:
+    world = World(settings.config_for("paper", {}))
+    return f"{world.map.name}, {world.law.cells.size} road cells, {int(world.map.blocked.sum())} blocked"
+
+
+def _sockets() -> str:
+    import zmq  # noqa: PLC0415  the command starts without ZeroMQ
+
+    from tmc.wire import messages, sockets  # noqa: PLC0415
+
+    with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
+        endpoint = f"ipc://{folder}/s"
+        server, client = sockets.router(context, endpoint), sockets.dealer(context, endpoint, "observer-doctor")
+        sockets.send(client, messages.StatusRequest())
+        answered = server.poll(2000)
+        server.close()
+        client.close()
+    if not answered:
+        raise RuntimeError("a message over ipc did not arrive in 2 s")
+    return f"ZeroMQ {zmq.zmq_version()} over ipc"
+
+
+def _disk() -> str:
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    if free < 1:
+        raise RuntimeError(f"{free:.1f} GiB free here: a long run logs more than that")
+    return f"{free:.0f} GiB free in this folder"
+
+
+CHECKS: dict[str, Callable[[], str]] = {
+    "cores": lambda: f"{os.cpu_count()}",
+    "map": _world,
+    "sockets": _sockets,
+    "disk": _disk,
+}
+
+
+def _settings(preset: str) -> int:
+    values = flat(settings.config_for(preset, {}))
+    for key, s in SETTINGS.items():
+        unit = f" {s.unit}" if s.unit else ""
+        source = f" [{s.source}]" if s.source else ""
+        print(f"{key} = {values[key]}{unit}\n    {s.about}{source}")
     return 0

@@ -29,7 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     }
     for view in VIEWS:
         sub = views.add_parser(view, help=about[view], description=about[view])
-        sub.add_argument("run", type=Path, help="run folder" + (", or one MCAP file" if view in {"info", "cat"} else ""))
+        sub.add_argument(
+            "run", type=Path, help="run folder" + (", or one MCAP file" if view in {"info", "cat"} else "")
+        )
         if view in {"moves", "uncertainty", "events"}:
             sub.add_argument("--episode", type=int, default=1, metavar="E", help="from 1 (default: 1)")
         if view == "info":

@@ -1,4 +1,101 @@
-def add_arguments(parser):
-    pass
-def main(args):
+"""`overfly map ...`: the maps, as text, as a picture, as CSV, and whether they are in order."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from tmc.kernel.roadmap import OBSTACLES, ROADS, MapError, RoadMap, builtin_maps, check, load_map
+
+DEFAULT = "downtown-toronto"
+NO_MATPLOTLIB = "a picture needs matplotlib: pip install 'overfly[figures]'"
+ABOUT = {
+    "list": "the maps that come with Overfly, and what their presets count",
+    "show": "draw a map as text, and as a picture with --out",
+    "export": "the grid as CSV, a line a row from the north: 0 free, 1 road, 2 blocked",
+    "check": "what to look at before flying a map; exit code 1 when there is something",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    views = parser.add_subparsers(dest="view", required=True, metavar="VIEW")
+    for view, about in ABOUT.items():
+        sub = views.add_parser(view, help=about, description=about)
+        if view == "list":
+            continue
+        sub.add_argument("name", nargs="?", default=DEFAULT, metavar="NAME",
+                         help="a built-in map, or the path of a text raster (default: %(default)s)")  # fmt: skip
+        sub.add_argument("--roads", choices=ROADS, default="main", help="classes of street (default: %(default)s)")
+        sub.add_argument("--obstacles", choices=OBSTACLES, default="static", help="default: %(default)s")
+        if view == "show":
+            sub.add_argument("--out", type=Path, metavar="FILE.png", help="also write a picture")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print one view."""
+    if args.view == "list":
+        return _list()
+    return _VIEWS[args.view](load_map(args.name, args.roads, args.obstacles), args)
+
+
+def _list() -> int:
+    print(f"{'map':<20}{'roads':<10}{'obstacles':<11}{'cells':>9}{'road':>7}{'blocked':>9}")
+    for name in builtin_maps():
+        for roads in ROADS:
+            for obstacles in OBSTACLES:
+                m = load_map(name, roads, obstacles)
+                size = f"{m.grid.rows} x {m.grid.cols}"
+                print(f"{name:<20}{roads:<10}{obstacles:<11}{size:>9}{m.road.sum():>7,}{m.blocked.sum():>9,}")
+    print("the paper's mission flies over roads main, obstacles static; `overfly map show` draws it")
     return 0
+
+
+def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
+    out: Path | None = args.out
+    if out is not None and out.suffix.lower() != ".png":
+        raise MapError(f"--out {out} is no PNG: give a name that ends in .png")
+    print(drawing(road_map))
+    if out is not None:
+        _picture(road_map, out)
+        print(f"picture: {out}")
+    return 0
+
+
+def drawing(road_map: RoadMap) -> str:
+    """The map as text, street-north on top, then the legend with counts; square where the lines are short enough."""
+    m, total = road_map, road_map.grid.size
+    rows = m.text().splitlines()
+    wide = [" ".join(row) for row in rows] if m.grid.cols <= 40 else rows
+    road, blocked = int(m.road.sum()), int(m.blocked.sum())
+    size = f"{m.grid.rows} x {m.grid.cols} cells of {m.cell_m:g} m"
+    counts = (("#", "road", road), (".", "free", total - road - blocked), ("X", "obstacle or no-fly", blocked))
+    legend = ", ".join(f"{sign} {what} {count:,} ({count / total:.0%})" for sign, what, count in counts)
+    credit = [m.attribution] if m.attribution else []
+    return "\n".join([*wide, "", f"{m.name}: {size}, street-north on top", legend, *credit])
+
+
+def _picture(road_map: RoadMap, out: Path) -> None:
+    try:
+        from tmc.analysis.figures import map_picture  # noqa: PLC0415  half a second, and an extra
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "matplotlib":
+            raise
+        raise MapError(NO_MATPLOTLIB) from None
+    map_picture(road_map, out)
+
+
+def _export(road_map: RoadMap, _args: argparse.Namespace) -> int:
+    sys.stdout.write(road_map.csv())
+    return 0
+
+
+def _check(road_map: RoadMap, _args: argparse.Namespace) -> int:
+    findings = check(road_map)
+    print("\n".join(findings) if findings else f"{road_map.name} is fine")
+    return 1 if findings else 0
+
+
+_VIEWS: dict[str, Callable[[RoadMap, argparse.Namespace], int]] = {"show": _show, "export": _export, "check": _check}

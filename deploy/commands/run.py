@@ -26,6 +26,7 @@ def add_mission_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Train, then say what came of it."""
     config = settings.config_for(args.preset, settings.chosen(args))
+    world = mission.check(config)
     out = mission.new_folder(args.out, args.preset)
-    code = mission.Mission(config, out, mission.command_line()).run(in_one_process=args.lockstep)
+    code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
     return code or report(out, as_json=args.json)

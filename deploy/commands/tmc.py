@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("preset", nargs="?", default="paper", help="settings to start from (default: paper)")
     parser.add_argument("--bind", default="tcp://127.0.0.1:5555", metavar="ENDPOINT",
-                        help="where the UAVs connect; the learner uses the next port (default: %(default)s)")  # fmt: skip
+                        help="for UAVs; the learner uses the next port (default: %(default)s)")  # fmt: skip
     parser.add_argument("--fly", metavar="WHO", help="fly a fixed policy or a planner; there is no learner")
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder; runs/tmc-<time> when left out")
     settings.add_options(parser)
@@ -31,6 +31,7 @@ def main(args: argparse.Namespace) -> int:
         pilot = who.resolve(args.fly)
         values = {**flat(config), **pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
         config, policy = build(values), pilot.policy
+    mission.check(config, policy)
     out = mission.new_folder(args.out, "tmc")
     (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
     path = None

@@ -1,1 +1,1 @@
-"""What a finished run says: metrics, figures and the report, all rebuilt from the log."""
+"""What a run says: metrics, report and figures, all rebuilt from its log. Only `figures` needs matplotlib."""

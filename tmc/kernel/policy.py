@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 
-from tmc.kernel.config import Config
+from tmc.kernel.config import Config, ConfigError, Network
 from tmc.kernel.grid import N_ACTIONS, Grid
 
 FORMAT = 1
@@ -57,6 +57,30 @@ def view_shape(config: Config, grid: Grid) -> tuple[int, int, int]:
         side = 2 * config.observation.radius + 1
         return N_CHANNELS, side, side
     return N_CHANNELS, grid.rows, grid.cols
+
+
+def features(network: Network, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns after the last convolution (no padding); raises ConfigError when nothing would be left."""
+    rows, cols = height, width
+    for _ in network.channels:
+        if min(rows, cols) < network.kernel:
+            raise ConfigError(
+                f"a view of {height} x {width} cells is too small for {len(network.channels)} convolutions with "
+                f"network.kernel = {network.kernel} and network.stride = {network.stride}: lower these, "
+                "or raise observation.radius"
+            )
+        rows, cols = ((n - network.kernel) // network.stride + 1 for n in (rows, cols))
+    return rows, cols
+
+
+def check_view(config: Config, shape: tuple[int, int, int]) -> None:
+    """Raise ConfigError when the network of these settings cannot take observations of this shape."""
+    near = config.observation.near
+    if 2 * near + 1 > min(shape[1:]):
+        raise ConfigError(
+            f"observation.near = {near} is larger than the view: choose {(min(shape[1:]) - 1) // 2} or less"
+        )
+    features(config.network, *shape[1:])
 
 
 def card_for(config: Config, grid: Grid, version: int, updates: int) -> PolicyCard:

@@ -1,0 +1,40 @@
+# Everything that a fresh machine needs is installed by the first target that needs it, into .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+RUN ?= runs/demo-$(shell date -u +%Y%m%d-%H%M%S)
+
+.PHONY: demo test check lint clean
+
+# The main job: three UAV processes, the TMC and the learner on downtown Toronto; then the policy against the baselines.
+demo: $(VENV)/.run
+	$(BIN)/overfly run quick --out $(RUN)
+	$(BIN)/overfly evaluate $(RUN) planner:random-road planner:random --seeds 5
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+check: lint test
+
+$(VENV)/bin/pip:
+	$(PYTHON) -m venv $(VENV)
+
+# The constraints pin what we develop with; pyproject.toml keeps the ranges that users need. torch goes first, so that no
+# later resolution can choose another build of it.
+$(VENV)/.run: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[learner,figures]"
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.run
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist

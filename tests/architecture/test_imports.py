@@ -1,0 +1,134 @@
+"""Who may import whom: the contracts of pyproject.toml, and where the heavy and the networked packages may appear."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("actors", "learner", "tmc", "deploy")
+SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+# Package -> the only files that may import it, anywhere in their text.
+HOMES: dict[str, tuple[str, ...]] = {
+    "torch": ("learner/*.py",),
+    "safetensors": ("learner/*.py",),
+    "onnx": ("learner/*.py",),
+    "onnxruntime": ("actors/policy.py",),
+    "mcap": ("tmc/record/*.py",),
+    "msgpack": ("tmc/wire/codec.py",),
+    "zmq": (
+        "actors/service.py",
+        "learner/service.py",
+        "tmc/service.py",
+        "tmc/wire/sockets.py",
+        "deploy/progress.py",
+        "deploy/commands/doctor.py",
+    ),
+}
+LONGEST = 350
+"""Lines in a module."""
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Top-level names of all that a file imports, within functions as well."""
+    for node in ast.walk(ast.parse((ROOT / path).read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module.partition(".")[0]
+
+
+def run(code: str) -> str:
+    """What `code` prints in a process of its own."""
+    command = [sys.executable, "-P", "-W", "error", "-c", code]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+def test_the_contracts_of_pyproject_hold() -> None:
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()"]
+    result = subprocess.run(
+        [*command, "--no-cache", "--no-logo"], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("package", HOMES)
+def test_a_package_is_imported_only_where_it_belongs(package: str) -> None:
+    users = [path.as_posix() for path in SOURCES if package in imported(path)]
+    assert users, f"nothing imports {package}: correct HOMES"
+    assert not [path for path in users if not any(fnmatch(path, home) for home in HOMES[package])]
+
+
+def loaded_after(modules: str) -> set[str]:
+    """Heavy packages in a process that has imported `modules`."""
+    heavy = "{'torch', 'onnx', 'onnxruntime', 'safetensors', 'matplotlib', 'learner'}"
+    return set(run(f"import sys, {modules}; print(*{heavy} & set(sys.modules))").split())
+
+
+def test_a_uav_with_a_planner_loads_no_network_library() -> None:
+    assert loaded_after("actors.service, actors.__main__") == set()
+
+
+def test_a_uav_with_a_policy_loads_no_torch() -> None:
+    assert loaded_after("actors.service, actors.__main__, actors.policy") == {"onnxruntime"}
+
+
+def test_the_tmc_loads_no_network_library() -> None:
+    assert loaded_after("tmc.__main__") == set()
+
+
+def test_the_command_loads_nothing_heavy_before_a_command_is_chosen() -> None:
+    assert loaded_after("deploy.cli") == set()
+
+
+@pytest.mark.parametrize("role", ["actors", "tmc"])
+def test_help_starts_no_network_library(role: str) -> None:
+    command = [sys.executable, "-P", "-X", "importtime", "-m", role, "--help"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    names = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines() if line.startswith("import time:")}
+    assert "tmc.kernel.config" in names
+    assert not names & {"torch", "onnx", "onnxruntime", "safetensors", "matplotlib"}
+
+
+def test_importing_does_no_work() -> None:
+    """No module that a UAV, the TMC or the command imports opens a socket, writes a file, or starts anything."""
+    kept = [p for p in SOURCES if p.parts[0] != "learner" and p.name != "policy.py"]
+    modules = [".".join(p.with_suffix("").parts).removesuffix(".__init__") for p in kept]
+    code = f"""
+import importlib, sys, threading
+import numpy, zmq, google.protobuf.descriptor_pool
+def watch(event, args):
+    if event == "open":
+        busy = isinstance(args[1], str) and set(args[1]) & set("wxa+") and "pycache" not in str(args[0])
+    else:
+        busy = event in {{"socket.bind", "socket.connect", "subprocess.Popen", "os.fork", "os.system"}}
+    if busy:
+        work.append((event, args))
+work = []
+sys.addaudithook(watch)
+for name in {modules!r}:
+    importlib.import_module(name)
+print(work, threading.active_count(), zmq.Context._instance)
+"""
+    assert run(code) == "[] 1 None"
+
+
+def test_modules_are_short() -> None:
+    lengths = {path.as_posix(): len((ROOT / path).read_text("utf-8").splitlines()) for path in SOURCES}
+    largest = sorted(lengths.items(), key=lambda item: -item[1])[:8]
+    listing = ", ".join(f"{path} {n}" for path, n in largest)
+    assert largest[0][1] <= LONGEST, f"modules of more than {LONGEST} lines; the largest: {listing}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_packages_are_typed(package: str) -> None:
+    assert (ROOT / package / "py.typed").is_file()

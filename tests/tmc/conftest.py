@@ -1,0 +1,270 @@
+"""What the TMC's tests share: whole missions without sockets, whose messages a test may interleave, lose and repeat."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.airspace import Waiting
+from actors.pilot import Phase, Pilot
+from actors.planners import PlannerDecider, Sight
+from actors.tracks import TableTracks, TrackTable
+from tmc.kernel.config import build
+from tmc.kernel.grid import N_ACTIONS
+from tmc.kernel.observation import Observer
+from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
+from tmc.kernel.world import World
+from tmc.station import Entry, Station, uav_name
+from tmc.wire import messages as m
+
+RASTER = """\
+############
+#..X.#....X#
+#..X.#.....#
+#....#..X..#
+############
+#..#...#...#
+#X.#...#.X.#
+#..#...#...#
+############
+"""
+
+
+class Paused(Exception):  # noqa: N818  it is no error: the pilot has flown one tick and can go on
+    """Lets a test interleave the pilots tick by tick."""
+
+
+class Wanderer:
+    """Half of the time towards the middle of the map, where the others are too; otherwise anywhere, blocked or not."""
+
+    def __init__(self, world: World) -> None:
+        self.grid = world.grid
+        self.middle = world.grid.cell(world.grid.rows // 2, world.grid.cols // 2)
+
+    def choose(self, sight: Sight) -> int:
+        if sight.draw >= 0.5:
+            return int((2 * sight.draw - 1) * N_ACTIONS)
+        targets = self.grid.target_lists[sight.cell]
+        inside = [a for a in range(N_ACTIONS) if targets[a] >= 0]
+        return min(inside, key=lambda a: self.grid.chebyshev(targets[a], self.middle))
+
+
+class SpyPilot(Pilot):
+    """A pilot that notes, at each tick, the observation and the actions that it may choose, and pauses after each move."""
+
+    seen: dict[tuple[int, int, int], tuple[np.ndarray[Any, Any], list[int]]]
+
+    def note(self) -> None:
+        """Keep what the UAV acts on at t, or would at the end of an episode."""
+        o = self.observer.observe(self.cell, self.peers, self.map_of(self.t))
+        mask = self.config.exploration.mask_blocked
+        could = self.observer.allowed(self.cell, self.peers) if mask else list(range(N_ACTIONS))
+        self.seen[self.episode, self.t, self.uav] = (o, could)
+
+    def _act(self) -> None:
+        self.note()
+        super()._act()
+
+    def _move(self) -> None:
+        super()._move()
+        raise Paused
+
+
+class Mission:
+    """A station and its UAVs, and all that is on the air between them; `play` lets chance choose what happens next."""
+
+    def __init__(
+        self, values: Mapping[str, Any], road_map: RoadMap | None = None, *, learning: bool = False, now: float = 1.0
+    ) -> None:
+        config = build({"training.episodes": 1, **values})
+        self.world, self.now = World(config, road_map), now
+        fixed = b"policy" if config.team.pilot == "policy" and not learning else None
+        self.station = Station(self.world, "run", learning=learning, policy=fixed)
+        self.N, self.T = config.team.size, config.training.ticks
+        self.observer = Observer(self.world)
+        self.table = TrackTable(self.N, self.T)
+        self.seen: dict[tuple[int, int, int], tuple[np.ndarray[Any, Any], list[int]]] = {}
+        self.entries: list[Entry] = []
+        self.notes: list[tuple[str, str]] = []
+        self.heard: list[tuple[str, m.Message]] = []
+        """What the station was told, in order."""
+        self.learner: list[m.Message] = []
+        self.up: list[deque[m.Message]] = [deque() for _ in range(self.N)]
+        self.down: list[deque[m.Message]] = [deque() for _ in range(self.N)]
+        self.home: set[int] = set()
+        self.lives = [0] * self.N
+        self.pilots: list[SpyPilot] = []
+        for i in range(self.N):
+            self.pilots.append(self._pilot(i))
+            self.up[i].append(m.Hello("uav", i, self.lives[i]))
+
+    def _pilot(self, i: int) -> SpyPilot:
+        who = self.world.config.team.pilot
+        planner = None if who == "policy" else PlannerDecider(self.world, who)
+        self.lives[i] += 1
+        pilot = SpyPilot(
+            self.world, i, self.lives[i], TableTracks(self.table, i), self.observer,
+            lambda _: Wanderer(self.world), planner,
+        )  # fmt: skip
+        pilot.seen = self.seen
+        return pilot
+
+    def tell(self, sender: str, message: m.Message) -> list[tuple[str, m.Message]]:
+        """The station takes a message; what it says to UAVs goes on the air. Returns all that it says."""
+        self.heard.append((sender, message))
+        self.station.handle(sender, message, self.now)
+        out = self.station.out.take()
+        self.entries += out.entries
+        self.notes += out.notes
+        for name, answer in out.sends:
+            if name.startswith("uav-"):
+                self.down[int(name[4:])].append(answer)
+            elif name == "learner":
+                self.learner.append(answer)
+        return out.sends
+
+    # What can happen next.
+
+    def choices(self, stuck: set[int]) -> list[tuple[str, int]]:
+        flying = (Phase.SENSE, Phase.ACT, Phase.MOVE)
+        return [
+            *(("up", i) for i in range(self.N) if self.up[i]),
+            *(("down", i) for i in range(self.N) if self.down[i]),
+            *(("fly", i) for i, p in enumerate(self.pilots) if p.phase in flying and i not in stuck),
+        ]
+
+    def happen(self, what: str, i: int) -> bool:
+        """One thing happens; False when the pilot could not fly on."""
+        if what == "up":
+            self.tell(uav_name(i), self.up[i].popleft())
+        elif what == "down":
+            self._obey(i, self.down[i].popleft())
+        else:
+            try:
+                record = self.pilots[i].advance()
+            except Waiting:
+                return False
+            except Paused:
+                return True
+            if record is not None:
+                self.up[i].append(record)
+        return True
+
+    def _obey(self, i: int, message: m.Message) -> None:
+        pilot, answer = self.pilots[i], None
+        if isinstance(message, m.Begin):
+            answer = pilot.begin(message)
+        elif isinstance(message, m.Map):
+            answer = pilot.on_map(message)
+        elif isinstance(message, m.Policy):
+            pilot.on_policy(message)
+        elif isinstance(message, m.End):
+            self.home.add(i)
+        assert not isinstance(message, m.Error), message.text
+        if pilot.phase is Phase.ACT and pilot.t == self.T:
+            pilot.note()
+        if answer is not None:
+            self.up[i].append(answer)
+
+    def silence(self) -> None:
+        """Nothing moves: every UAV repeats itself, as its service does after a second."""
+        for i, pilot in enumerate(self.pilots):
+            if i in self.home:
+                continue
+            if pilot.phase is Phase.MAP and pilot.pending is not None:
+                self.up[i].append(pilot.pending)
+            elif pilot.phase is Phase.POLICY:
+                self.up[i].append(m.PolicyRequest(pilot.wanted))
+            else:
+                self.up[i].append(m.Hello("uav", i, self.lives[i]))
+
+    def lose(self, i: int, *, on_the_air: bool) -> None:
+        """UAV i's process dies, with what it was about to send unless that is on the air; a new one says hello."""
+        if not on_the_air:
+            self.up[i].clear()
+        self.down[i].clear()
+        self.pilots[i] = self._pilot(i)
+        self.up[i].append(m.Hello("uav", i, self.lives[i]))
+
+    def steps(self, rng: Random | None = None, crash: float = 0.0) -> Iterator[tuple[str, int]]:
+        """Let things happen until all UAVs are home, and yield after each; without `rng` in a fixed order."""
+        stuck: set[int] = set()
+        silences = 0
+        while len(self.home) < self.N:
+            if rng is not None and crash and rng.random() < crash:
+                self.lose(rng.randrange(self.N), on_the_air=rng.random() < 0.5)
+                stuck.clear()
+            choices = self.choices(stuck)
+            if not choices:
+                silences += 1
+                assert silences < 3, f"the mission hangs: {[(p.t, p.phase) for p in self.pilots]}"
+                self.silence()
+                stuck.clear()
+                continue
+            what, i = rng.choice(choices) if rng is not None else choices[0]
+            if self.happen(what, i):
+                stuck.clear()
+                silences = 0 if what == "fly" else silences
+                yield what, i
+            else:
+                stuck.add(i)
+
+    def play(self, rng: Random | None = None, crash: float = 0.0) -> Mission:
+        """All of `steps`."""
+        for _ in self.steps(rng, crash):
+            pass
+        return self
+
+    # What came of it.
+
+    @property
+    def records(self) -> list[m.Record]:
+        """The records in the journal, in the order in which they were taken."""
+        return [e.values["record"] for e in self.entries if "record" in e.values]
+
+    def flown(self) -> dict[tuple[int, int], dict[str, list[Any]]]:
+        """(episode, uav) -> the cells, actions, blocks and own rewards of its whole flight, from the journal."""
+        whole: dict[tuple[int, int], dict[str, list[Any]]] = {}
+        for r in self.records:
+            names = ("cells", "actions", "blocks", "rewards", "seen_tick", "seen_cell")
+            parts = whole.setdefault((r.episode, r.uav), {name: [] for name in names})
+            for name, values in parts.items():
+                values.extend(getattr(r, name).tolist())
+        return whole
+
+    def row(self, episode: int, tick: int) -> int:
+        """The replay's number of a tick."""
+        return (episode - 1) * (self.T + 1) + tick
+
+    def differences(self, keys: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+        """Of these (episode, tick, uav), those that the replay rebuilds otherwise than the UAV saw them."""
+        rows = np.array([self.row(e, t) for e, t, _ in keys])
+        o, allowed = self.station.replay.observe(rows, np.array([i for _, _, i in keys]))
+        wrong = []
+        for k, key in enumerate(keys):
+            saw, could = self.seen[key]
+            if saw.tobytes() != o[k].tobytes() or np.flatnonzero(allowed[k]).tolist() != could:
+                wrong.append(key)
+        return wrong
+
+
+@pytest.fixture(scope="session")
+def town() -> RoadMap:
+    """A small map with obstacles, where UAVs meet often."""
+    return parse_raster(RASTER)
+
+
+@pytest.fixture(scope="session")
+def toronto() -> RoadMap:
+    return load_map("downtown-toronto")
+
+
+@pytest.fixture(scope="session")
+def mission() -> Callable[..., Mission]:
+    """A mission with dotted keys replaced; see `Mission`."""
+    return Mission

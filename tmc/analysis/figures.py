@@ -1,0 +1,149 @@
+"""The pictures of a run, each a PNG in RUN/report/: map, paths, and curves of training or uncertainty by tick."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from numpy.typing import NDArray
+
+from tmc.analysis import style
+from tmc.analysis.flown import Episode, Flown, Learning
+from tmc.analysis.mapfigures import map_picture, paths_picture
+from tmc.analysis.summary import Summary
+
+__all__ = ["curves_picture", "draw", "map_picture", "paths_picture", "uncertainty_picture"]
+
+POINTS = 2000
+"""Points that a curve by updates is thinned to: more cannot be seen."""
+
+
+def draw(
+    flown: Flown, summary: Summary, episode: int | None = None, baselines: Mapping[str, float] | None = None
+) -> list[Path]:
+    """Make the pictures of a run; returns their paths.
+
+    `episode` for paths and ticks, by default the last one that is complete. `baselines`: dashed lines by name,
+    uncertainty a road cell.
+    """
+    folder = flown.folder / "report"
+    shown = flown.episode(summary.last.episode if episode is None else episode)
+    made = [
+        map_picture(flown.world.map, folder / "map.png", shown.cells[0][shown.cells[0] >= 0].tolist()),
+        paths_picture(flown.world, shown, folder / "paths.png"),
+    ]
+    if summary.mission.learning:
+        return [*made, curves_picture(flown, summary, folder / "curves.png", baselines or {})]
+    return [*made, uncertainty_picture(flown, summary, shown, folder / "uncertainty.png")]
+
+
+def curves_picture(flown: Flown, summary: Summary, path: Path, baselines: Mapping[str, float]) -> Path:
+    """Four curves of training: three by episode, one by updates."""
+    made = style.figure(11, 7.5)
+    ((top, reward), (blocked, learning)) = made.subplots(2, 2)
+    _uncertainty_curve(top, summary, baselines)
+    _reward_curve(reward, summary)
+    _blocked_curve(blocked, summary)
+    _learning_curve(learning, flown.learning)
+    for axes in (top, reward, blocked):
+        axes.set_xlabel(f"episode (of {summary.mission.ticks:,} ticks)")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    m = summary.mission
+    made.suptitle(f"Training of {m.uavs} UAVs on {m.map}, scenario {m.scenario}, $T_u$ = {m.T_u} ticks, seed {m.seed}")
+    return style.save(made, path)
+
+
+def _by_episode(summary: Summary, name: str) -> tuple[list[int], list[float]]:
+    facts = [f for f in summary.episodes if f.complete] or list(summary.episodes)
+    return [f.episode for f in facts], [float(getattr(f, name)) for f in facts]
+
+
+def _curve(axes: Any, x: Any, y: Any, colour: str, label: str = "") -> None:
+    style.plain(axes)
+    axes.plot(x, y, color=colour, linewidth=1.6, marker="o" if len(x) <= 50 else "", markersize=4, label=label)
+
+
+def _uncertainty_curve(axes: Any, summary: Summary, baselines: Mapping[str, float]) -> None:
+    _curve(axes, *_by_episode(summary, "per_cell"), style.BLUE, "the team")
+    if summary.lower_bound_per_cell is not None:
+        axes.axhline(summary.lower_bound_per_cell, color=style.BLACK, linewidth=1.2, label="lower bound")
+    for (name, value), colour in zip(baselines.items(), _repeat(style.UAV_COLOURS), strict=False):
+        axes.axhline(value, color=colour, linewidth=1.4, linestyle="--", label=name)
+    axes.set_ylim(bottom=0)
+    what = "share of cells with an active event" if summary.mission.scenario == 1 else "mean uncertainty"
+    axes.set(title="Uncertainty, eq. (6): lower is better", ylabel=f"{what} a road cell")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _repeat(colours: tuple[str, ...]) -> tuple[str, ...]:
+    return colours * 8
+
+
+def _reward_curve(axes: Any, summary: Summary) -> None:
+    _curve(axes, *_by_episode(summary, "reward"), style.GREEN)
+    axes.set(title="Reward, with exploration", ylabel="reward a UAV a tick")
+
+
+def _blocked_curve(axes: Any, summary: Summary) -> None:
+    causes = (("another UAV", "blocked_uav", style.VERMILION), ("obstacle or no-fly", "blocked_obstacle", style.PURPLE),
+              ("edge of the grid", "blocked_grid", style.ORANGE))  # fmt: skip
+    _, moves = _by_episode(summary, "moves")
+    for label, name, colour in causes:
+        x, count = _by_episode(summary, name)
+        _curve(axes, x, 100 * np.array(count) / np.maximum(moves, 1), colour, label)
+    axes.set_ylim(bottom=0)
+    axes.set(title="Blocked moves by cause, with exploration", ylabel="share of moves (%)")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _learning_curve(axes: Any, learning: Learning) -> None:
+    """Loss on the left, logarithmic, and Q values on the right."""
+    x = _thin(learning.updates)
+    axes.set(title="Learning", xlabel="updates of the network", ylabel="loss of a minibatch")
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    style.plain(axes)
+    if not x.size:
+        axes.text(0.5, 0.5, "no updates in the logs", transform=axes.transAxes, ha="center", color=style.GREY)
+        return
+    lines = axes.plot(x, _thin(learning.loss), color=style.BLUE, linewidth=0.7, label="loss (left)")
+    if (learning.loss > 0).any():
+        axes.set_yscale("log")
+    if np.isfinite(learning.q_mean).any():
+        right = axes.twinx()
+        right.spines["top"].set_visible(False)
+        right.set_ylabel("Q value (rewards as scaled)")
+        lines += right.plot(x, _thin(learning.q_mean), color=style.ORANGE, linewidth=1.2, label="mean Q (right)")
+        target = _thin(learning.target_mean)
+        lines += right.plot(x, target, color=style.BLACK, linewidth=0.8, linestyle=":", label="mean target (right)")
+    axes.legend(handles=lines, frameon=False, fontsize=8)
+
+
+def _thin(values: NDArray[Any]) -> NDArray[Any]:
+    return values[:: max(1, values.size // POINTS)]
+
+
+def uncertainty_picture(flown: Flown, summary: Summary, shown: Episode, path: Path) -> Path:
+    """The sum over cells by tick of one episode, other episodes in grey, with its mean and the bound."""
+    made = style.figure(9, 4.8)
+    axes, m = made.add_subplot(), summary.mission
+    style.plain(axes)
+    others = [e for e in flown.episodes if e.number != shown.number]
+    for i, episode in enumerate(others):
+        label = "other episodes" if i == 0 else None
+        axes.plot(episode.uncertainty, color="#BBBBBB", linewidth=0.7, label=label)
+    axes.plot(shown.uncertainty, color=style.BLUE, linewidth=1.3, label=f"episode {shown.number}")
+    mean = float(np.nanmean(shown.uncertainty[1:]))
+    axes.axhline(mean, color=style.ORANGE, linestyle="--", linewidth=1.5, label=f"its mean, eq. (6): {mean:.1f}")
+    if summary.lower_bound is not None:
+        label = f"lower bound of the mean: {summary.lower_bound:.1f}"
+        axes.axhline(summary.lower_bound, color=style.BLACK, linewidth=1.2, label=label)
+    axes.set(xlim=(0, m.ticks), xlabel="tick (60 s each)")
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("active events" if m.scenario == 1 else f"uncertainty, sum over {m.monitored_cells:,} cells")
+    what = "Active events" if m.scenario == 1 else "Uncertainty"
+    axes.set_title(f"{what} by tick: {m.who}, {m.uavs} UAVs, scenario {m.scenario}, $T_u$ = {m.T_u} ticks")
+    axes.legend(loc="lower right", frameon=False, fontsize=9)
+    return style.save(made, path)

@@ -1,0 +1,131 @@
+"""The summary as text: at most 24 lines of 80 columns, plain words, numbers with their units; then where things lie."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tmc.analysis.summary import EpisodeFacts, Summary
+
+WIDTH, LINES = 80, 24
+_LABEL = 11
+
+
+def text(s: Summary, pictures: Sequence[Path] = ()) -> str:
+    """The report, without a newline at its end."""
+    paths = list(_paths(s, pictures))
+    lines = [*_mission(s), "", *_uncertainty(s), "", *_facts(s)]
+    notes = _notes(s, LINES - len(lines) - len(paths))
+    return "\n".join([*lines, *notes, *paths])
+
+
+def _row(label: str, words: str) -> str:
+    """A label and its text, cut where the screen ends."""
+    return f"{label:<{_LABEL}}" + textwrap.shorten(words, WIDTH - _LABEL, placeholder=" ...")
+
+
+def _mission(s: Summary) -> Iterator[str]:
+    m = s.mission
+    who = " in training" if m.learning else f", {m.who}"
+    yield _row("Team", f"{_count(m.uavs, 'UAV')}{who}; scenario {m.scenario}, T_u = {_count(m.T_u, 'tick')}")
+    yield _row("Map", f"{m.map} ({m.roads}, {m.obstacles}): {m.road_cells:,} road cells of {m.cell_m:g} m")
+    yield _row(
+        "Episodes", f"{m.episodes_flown:,} of {m.episodes_planned:,}, of {m.ticks:,} ticks of 60 s; seed {m.seed}"
+    )
+
+
+def _uncertainty(s: Summary) -> Iterator[str]:
+    """A table: eq. (6) of a few episodes, and of the bound."""
+    cell = "road cell" if s.mission.monitored_cells == s.mission.road_cells else "cell"
+    what = "Active events" if s.mission.scenario == 1 else "Uncertainty"
+    yield f"{what + ', mean of ticks':<34}{'a ' + cell:>14}{'all cells':>14}{'x bound':>12}"
+    for label, f in _chosen(s):
+        yield _table_row(label, f.per_cell, f.uncertainty, f.times_bound)
+    if s.mean.episodes > 1:
+        label = f"mean of the last {s.mean.episodes}" if s.mission.learning else f"mean of all {s.mean.episodes}"
+        yield _table_row(label, s.mean.per_cell, s.mean.uncertainty, s.mean.times_bound)
+    if s.lower_bound is not None and s.lower_bound_per_cell is not None:
+        yield _table_row("least that any team could reach", s.lower_bound_per_cell, s.lower_bound, 1.0)
+
+
+def _chosen(s: Summary) -> list[tuple[str, EpisodeFacts]]:
+    """First, best and last episode, each once."""
+    if s.first == s.last:
+        return [(f"episode {s.first.episode}", s.first)]
+    rows = [("first", s.first), ("best", s.best), ("last", s.last)]
+    if s.best in (s.first, s.last):
+        rows = [("first, best" if s.best == s.first else "first", s.first),
+                ("last, best" if s.best == s.last else "last", s.last)]  # fmt: skip
+    return [(f"{name}: episode {f.episode}", f) for name, f in rows]
+
+
+def _table_row(label: str, per_cell: float, total: float, times_bound: float | None) -> str:
+    times = "-" if times_bound is None else f"{times_bound:.3f}"
+    return f"  {label:<32}{per_cell:>14.4f}{total:>14.1f}{times:>12}"
+
+
+def _facts(s: Summary) -> Iterator[str]:
+    last, p, h = s.last, s.pace, s.health
+    which = f"episode {last.episode}"
+    earlier = "" if s.first == last else f", {s.first.reward:.3f} in episode {s.first.episode}"
+    yield _row("Reward", f"{last.reward:.3f} a UAV a tick in {which}{earlier}")
+    causes = f"by UAVs {s.blocked_uav:,}, obstacles {s.blocked_obstacle:,}, edge {s.blocked_grid:,}"
+    yield _row("Blocked", f"{s.blocked:,} of {s.moves:,} moves ({s.blocked_share:.2%}): {causes}")
+    roads = f"{last.on_road:.1%} of ticks over road, {last.coverage:.1%} of road cells visited"
+    yield _row("Roads", f"{roads} in {which}")
+    if last.events_appeared is not None:
+        yield _row("Events", f"{_events(last)} in {which}")
+    yield _row("Pace", f"{p.ticks:,} ticks in {_clock(p.seconds)}, {p.ticks_per_second:,.0f} a second")
+    if s.mission.learning:
+        loss = "" if p.loss is None else f"; last loss {p.loss:.3g}"
+        yield _row("Learning", f"{p.updates:,} updates, {p.updates_per_second:,.0f} a second{loss}")
+    yield _row("Processes", _processes(s))
+    yield _row("Log", f"{_size(h.log_bytes)} in {_count(len(h.log_files), 'file')}" + ("" if h.notes else ", sound"))
+
+
+def _events(f: EpisodeFacts) -> str:
+    wait = "" if f.mean_wait is None else f", {f.mean_wait:.1f} ticks waited"
+    return f"{f.events_appeared:,} appeared, {f.events_cleared:,} cleared{wait}"
+
+
+def _processes(s: Summary) -> str:
+    codes, restarts = s.health.exit_codes, s.health.restarts
+    if not codes:
+        return "no exit codes: one process, or still flying, or killed"
+    bad = [f"{name} ended with {'no exit code' if code is None else code}" for name, code in codes.items() if code != 0]
+    again = [f"{name} restarted {_count(n, 'time')}" for name, n in restarts.items()]
+    return ", ".join(bad + again) or f"all {len(codes)} ended in order, none was restarted"
+
+
+def _notes(s: Summary, room: int) -> list[str]:
+    """What is not as it should be, on so many lines; the rest of a long list is in summary.json."""
+    cut = [f"episode {f.episode} breaks off at tick {f.ticks:,}" for f in s.episodes if not f.complete]
+    indent = " " * _LABEL
+    lines = [line for note in (*cut, *s.health.notes)
+             for line in textwrap.wrap(note, WIDTH, initial_indent=f"{'Note':<{_LABEL}}", subsequent_indent=indent)]  # fmt: skip
+    return lines if len(lines) <= room else [*lines[: max(room - 1, 0)], f"{indent}and more: see summary.json"]
+
+
+def _paths(s: Summary, pictures: Sequence[Path]) -> Iterator[str]:
+    """Paths stay whole, so that they can be copied, even where they are long."""
+    yield f"{'Logs':<{_LABEL}}{s.run}/*.mcap*"
+    yield f"{'Summary':<{_LABEL}}{s.run}/summary.json"
+    if pictures:
+        yield f"{'Pictures':<{_LABEL}}{pictures[0].parent}/{{{','.join(sorted(p.name for p in pictures))}}}"
+
+
+def _count(n: int, thing: str) -> str:
+    return f"{n:,} {thing}" + ("" if n == 1 else "s")
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
+
+
+def _size(size: int) -> str:
+    return f"{size / 1e6:,.1f} MB" if size >= 1e6 else f"{size / 1e3:,.0f} kB"
