@@ -104,16 +104,18 @@ class Supervisor:
         return f": {lines[-1].removeprefix('overfly: ')[:300]}" if lines and lines[-1].startswith("overfly:") else ""
 
     def stop(self) -> None:
-        """Ask everybody to leave, UAVs first and the TMC last; kill who does not."""
-        for running in reversed(self.running):
-            if running.popen is not None and running.popen.poll() is None:
-                running.popen.terminate()
-        self.wait(GRACE)
+        """Ask everybody to leave; the TMC last, so that nothing is shipped in vain. Kill who does not."""
+        for leads in (False, True):
+            group = [r for r in self.running if r.child.leads is leads]
+            for running in group:
+                if running.popen is not None and running.popen.poll() is None:
+                    running.popen.terminate()
+            self.wait(GRACE, group)
 
-    def wait(self, patience: float) -> None:
-        """Wait for everybody to leave; kill who has not after `patience` seconds."""
+    def wait(self, patience: float, group: list[_Running] | None = None) -> None:
+        """Wait for everybody (or a group) to leave; kill who has not after `patience` seconds."""
         until = time.monotonic() + patience
-        for running in self.running:
+        for running in self.running if group is None else group:
             if running.popen is None:
                 continue
             try:

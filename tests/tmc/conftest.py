@@ -13,6 +13,7 @@ import pytest
 from actors.airspace import Waiting
 from actors.pilot import Phase, Pilot
 from actors.planners import PlannerDecider, Sight
+from actors.radio import RadioTracks
 from actors.tracks import TableTracks, TrackTable
 from tmc.kernel.config import build
 from tmc.kernel.grid import N_ACTIONS
@@ -76,13 +77,16 @@ class SpyPilot(Pilot):
 
 
 class Mission:
-    """A station and its UAVs, and all that is on the air between them; `play` lets chance choose what happens next."""
+    """A station and its UAVs, and all that is on the air between them; `play` lets chance choose what happens next.
+
+    The UAVs share a table of tracks, or, with `radio`, tell each other by beacons that the station passes on.
+    """
 
     def __init__(
-        self, values: Mapping[str, Any], road_map: RoadMap | None = None, *, learning: bool = False, now: float = 1.0
+        self, values: Mapping[str, Any], road_map: RoadMap | None = None, *, learning: bool = False, radio: bool = False
     ) -> None:
         config = build({"training.episodes": 1, **values})
-        self.world, self.now = World(config, road_map), now
+        self.world, self.radio = World(config, road_map), radio
         fixed = b"policy" if config.team.pilot == "policy" and not learning else None
         self.station = Station(self.world, "run", learning=learning, policy=fixed)
         self.N, self.T = config.team.size, config.training.ticks
@@ -97,6 +101,8 @@ class Mission:
         self.up: list[deque[m.Message]] = [deque() for _ in range(self.N)]
         self.down: list[deque[m.Message]] = [deque() for _ in range(self.N)]
         self.home: set[int] = set()
+        self.waits: dict[int, Waiting] = {}
+        self.asked = 0
         self.lives = [0] * self.N
         self.pilots: list[SpyPilot] = []
         for i in range(self.N):
@@ -107,9 +113,11 @@ class Mission:
         who = self.world.config.team.pilot
         planner = None if who == "policy" else PlannerDecider(self.world, who)
         self.lives[i] += 1
+        tracks: TableTracks | RadioTracks = TableTracks(self.table, i)
+        if self.radio:
+            tracks = RadioTracks(i, self.N, self.world.grid, self.observer.sensing, self.up[i].append)
         pilot = SpyPilot(
-            self.world, i, self.lives[i], TableTracks(self.table, i), self.observer,
-            lambda _: Wanderer(self.world), planner,
+            self.world, i, self.lives[i], tracks, self.observer, lambda _: Wanderer(self.world), planner
         )  # fmt: skip
         pilot.seen = self.seen
         return pilot
@@ -117,7 +125,7 @@ class Mission:
     def tell(self, sender: str, message: m.Message) -> list[tuple[str, m.Message]]:
         """The station takes a message; what it says to UAVs goes on the air. Returns all that it says."""
         self.heard.append((sender, message))
-        self.station.handle(sender, message, self.now)
+        self.station.handle(sender, message, 1.0)
         out = self.station.out.take()
         self.entries += out.entries
         self.notes += out.notes
@@ -147,7 +155,8 @@ class Mission:
         else:
             try:
                 record = self.pilots[i].advance()
-            except Waiting:
+            except Waiting as waiting:
+                self.waits[i] = waiting
                 return False
             except Paused:
                 return True
@@ -165,6 +174,10 @@ class Mission:
             pilot.on_policy(message)
         elif isinstance(message, m.End):
             self.home.add(i)
+        elif isinstance(message, m.Beacon):
+            tracks = pilot.airspace.tracks
+            assert isinstance(tracks, RadioTracks)
+            tracks.hear(message)
         assert not isinstance(message, m.Error), message.text
         if pilot.phase is Phase.ACT and pilot.t == self.T:
             pilot.note()
@@ -176,6 +189,10 @@ class Mission:
         for i, pilot in enumerate(self.pilots):
             if i in self.home:
                 continue
+            tracks = pilot.airspace.tracks
+            if i in self.waits and isinstance(tracks, RadioTracks):
+                tracks.ask(self.waits[i].peer, self.waits[i].tick)
+                self.asked += 1
             if pilot.phase is Phase.MAP and pilot.pending is not None:
                 self.up[i].append(pilot.pending)
             elif pilot.phase is Phase.POLICY:
@@ -202,13 +219,14 @@ class Mission:
             choices = self.choices(stuck)
             if not choices:
                 silences += 1
-                assert silences < 3, f"the mission hangs: {[(p.t, p.phase) for p in self.pilots]}"
+                assert silences < 12, f"the mission hangs: {[(p.t, p.phase) for p in self.pilots]}"
                 self.silence()
                 stuck.clear()
                 continue
             what, i = rng.choice(choices) if rng is not None else choices[0]
             if self.happen(what, i):
                 stuck.clear()
+                self.waits.clear()
                 silences = 0 if what == "fly" else silences
                 yield what, i
             else:

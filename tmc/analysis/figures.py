@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tmc.analysis import style
 from tmc.analysis.flown import Episode, Flown, Learning
 from tmc.analysis.mapfigures import map_picture, paths_picture
-from tmc.analysis.summary import Summary
+from tmc.analysis.summary import Mission, Summary
 
 __all__ = ["curves_picture", "draw", "map_picture", "paths_picture", "uncertainty_picture"]
 
@@ -52,8 +52,12 @@ def curves_picture(flown: Flown, summary: Summary, path: Path, baselines: Mappin
         axes.set_xlabel(f"episode (of {summary.mission.ticks:,} ticks)")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     m = summary.mission
-    made.suptitle(f"Training of {m.uavs} UAVs on {m.map}, scenario {m.scenario}, $T_u$ = {m.T_u} ticks, seed {m.seed}")
+    made.suptitle(f"Training of {m.uavs} UAVs on {m.map}, scenario {m.scenario}, {_period(m)}, seed {m.seed}")
     return style.save(made, path)
+
+
+def _period(m: Mission) -> str:
+    return f"$T_u$ = {m.T_u} tick" + ("" if m.T_u == 1 else "s")
 
 
 def _by_episode(summary: Summary, name: str) -> tuple[list[int], list[float]]:
@@ -144,6 +148,6 @@ def uncertainty_picture(flown: Flown, summary: Summary, shown: Episode, path: Pa
     axes.set_ylim(bottom=0)
     axes.set_ylabel("active events" if m.scenario == 1 else f"uncertainty, sum over {m.monitored_cells:,} cells")
     what = "Active events" if m.scenario == 1 else "Uncertainty"
-    axes.set_title(f"{what} by tick: {m.who}, {m.uavs} UAVs, scenario {m.scenario}, $T_u$ = {m.T_u} ticks")
+    axes.set_title(f"{what} by tick: {m.who}, {m.uavs} UAVs, scenario {m.scenario}, {_period(m)}")
     axes.legend(loc="lower right", frameon=False, fontsize=9)
     return style.save(made, path)

@@ -56,7 +56,8 @@ def paths_picture(world: World, episode: Episode, path: Path) -> Path:
     handles += [_marker("o", "white", f"at tick {end - len(flown) + 1:,}", edge=style.GREY, size=6),
                 _marker("o", style.GREY, f"at tick {end:,}")]  # fmt: skip
     _legend(made, handles)
-    axes.set_title(f"Paths of {flown.shape[1]} UAVs over the last {len(flown) - 1} ticks of episode {episode.number}")
+    what = "active events" if world.config.scenario == 1 else "uncertainty"
+    axes.set_title(f"Paths of episode {episode.number}, last {len(flown) - 1} ticks, and {what} at tick {end:,}")
     return style.save(made, path)
 
 
@@ -89,8 +90,7 @@ def _ground(made: Figure, axes: Any, world: World, episode: Episode, end: int) -
         handles += [Patch(color="#C9C9C9", label="road"), Patch(color=style.YELLOW, label=f"active event ({count})")]
     else:
         image = _cells_image(axes, world.map, values, cmap=style.UNCERTAINTY, vmin=0, vmax=1)
-        label = f"uncertainty of a cell at tick {end:,} (0: just visited)"
-        made.colorbar(image, ax=axes, label=label, shrink=0.7, pad=0.02)
+        made.colorbar(image, ax=axes, label="uncertainty of a cell", shrink=0.7, pad=0.02)
     _grid_lines(axes, world.map)
     return handles
 

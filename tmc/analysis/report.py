@@ -43,7 +43,11 @@ def _uncertainty(s: Summary) -> Iterator[str]:
     for label, f in _chosen(s):
         yield _table_row(label, f.per_cell, f.uncertainty, f.times_bound)
     if s.mean.episodes > 1:
-        label = f"mean of the last {s.mean.episodes}" if s.mission.learning else f"mean of all {s.mean.episodes}"
+        label = (
+            f"mean of the last {s.mean.episodes} episodes"
+            if s.mission.learning
+            else f"mean of {s.mean.episodes} episodes"
+        )
         yield _table_row(label, s.mean.per_cell, s.mean.uncertainty, s.mean.times_bound)
     if s.lower_bound is not None and s.lower_bound_per_cell is not None:
         yield _table_row("least that any team could reach", s.lower_bound_per_cell, s.lower_bound, 1.0)
@@ -102,8 +106,9 @@ def _notes(s: Summary, room: int) -> list[str]:
     """What is not as it should be, on so many lines; the rest of a long list is in summary.json."""
     cut = [f"episode {f.episode} breaks off at tick {f.ticks:,}" for f in s.episodes if not f.complete]
     indent = " " * _LABEL
-    lines = [line for note in (*cut, *s.health.notes)
-             for line in textwrap.wrap(note, WIDTH, initial_indent=f"{'Note':<{_LABEL}}", subsequent_indent=indent)]  # fmt: skip
+    first = f"{'Note':<{_LABEL}}"
+    notes = (textwrap.wrap(n, WIDTH, initial_indent=first, subsequent_indent=indent) for n in (*cut, *s.health.notes))
+    lines = [line for note in notes for line in note]
     return lines if len(lines) <= room else [*lines[: max(room - 1, 0)], f"{indent}and more: see summary.json"]
 
 

@@ -67,7 +67,9 @@ def _map(config: Config, csv: str | None) -> tuple[RoadMap, list[str]]:
     except MapError as error:
         if csv is None:
             raise RecordError(f"the run's map cannot be loaded, and its log has no copy: {error}") from None
-        return map_of_csv(world.map, csv), [f"map {world.map}: its file is gone, the copy in the log is used"]
+        return map_of_csv(world.map, csv), [
+            f"map {world.map}: its file is gone; the log's copy is used, with cells of {CELL_M:g} m"
+        ]
     if csv is None or road_map.csv() == csv:
         return road_map, []
     return map_of_csv(world.map, csv, road_map.cell_m), [f"map {world.map}: changed since the run, the log's is used"]

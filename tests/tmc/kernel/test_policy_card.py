@@ -85,7 +85,8 @@ def test_text_that_is_no_card_is_refused(text: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "[]", "{}", "null", "7", "NaN", '"overfly"', pytest.param("[" * 5000, id="nested lists"), pytest.param('{"a":' * 5000, id="nested maps"),
+        "[]", "{}", "null", "7", "NaN", '"overfly"',
+        pytest.param("[" * 5000, id="nested lists"), pytest.param('{"a":' * 5000, id="nested maps"),
         json.dumps({**dataclasses.asdict(card_for(build({}), GRID, 1, 1)), "colour": "red"}),
         json.dumps({k: v for k, v in dataclasses.asdict(card_for(build({}), GRID, 1, 1)).items() if k != "view"}),
     ],

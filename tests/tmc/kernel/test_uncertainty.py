@@ -99,7 +99,7 @@ def test_merge_is_commutative_associative_and_idempotent(
 
 
 @QUICK
-@given(st.lists(VISITS, min_size=1, max_size=6), st.randoms(use_true_random=False))
+@given(st.lists(VISITS, min_size=1, max_size=4), st.randoms(use_true_random=False))
 def test_late_doubled_and_reordered_records_give_the_same_map(
     records: list[NDArray[np.uint16]], random: object
 ) -> None:

@@ -19,7 +19,7 @@ from tmc.wire.codec import decode, encode
 from tmc.wire.messages import EMPTY, MESSAGES, Message
 from tmc.wire.sockets import PART_LIMIT
 
-QUICK = settings(max_examples=30, deadline=None)
+QUICK = settings(max_examples=15, deadline=None)
 Valid = Callable[[type[Message]], st.SearchStrategy[Message]]
 Same = Callable[[Message, Message], bool]
 IDS = [cls.__name__ for cls in MESSAGES]

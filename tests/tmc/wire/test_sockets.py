@@ -117,7 +117,7 @@ def test_round_trip(radio: Radio, endpoint: str, same: Same) -> None:
     assert same(wait_message(client), answer)
 
 
-def test_large_frames_are_not_copied_and_cannot_be_written(radio: Radio, ipc: str) -> None:
+def test_large_frames_are_not_copied(radio: Radio, ipc: str) -> None:
     bound, client = radio.router(ipc), radio.dealer(ipc, "learner")
     meet(bound, client, b"learner")
     assert sockets.send(bound, batch(8), to=b"learner")
@@ -126,8 +126,6 @@ def test_large_frames_are_not_copied_and_cannot_be_written(radio: Radio, ipc: st
     message = decode(frames)
     assert isinstance(message, Minibatch)
     assert np.shares_memory(message.observation, np.frombuffer(frames[1], "u1"))
-    with pytest.raises(ValueError, match="read-only"):
-        message.observation[0] = 0
 
 
 def test_every_client_gets_its_own_answer(radio: Radio, endpoint: str) -> None:

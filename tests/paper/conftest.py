@@ -1,0 +1,117 @@
+"""A mission flown by the real parties in one process, and everything that was said and done, for the paper's laws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from actors.fleet import Fleet
+from actors.pilot import Pilot
+from actors.planners import PlannerDecider, Sight
+from actors.tracks import TableTracks, TrackTable
+from tmc.kernel.config import build
+from tmc.kernel.roadmap import parse_raster
+from tmc.kernel.world import World
+from tmc.station import Entry, Station, uav_name
+from tmc.wire import messages as m
+
+TOWN = """\
+.#..#...
+####X###
+.#..#..#
+.#####.#
+X#..####
+.#..#..X
+"""
+
+
+@dataclass
+class Flown:
+    """What became of a mission; `cells[episode]`: shape (T + 1, N); `sights`: by (episode, uav, tick)."""
+
+    world: World
+    station: Station
+    pilots: list[Pilot] = field(default_factory=list)
+    records: list[m.Record] = field(default_factory=list)
+    maps: list[tuple[int, m.Map]] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)
+    sights: dict[tuple[int, int, int], Sight] = field(default_factory=dict)
+
+    @cached_property
+    def cells(self) -> dict[int, NDArray[np.int64]]:
+        config = self.world.config
+        shape = (config.training.ticks + 1, config.team.size)
+        flown = {e: np.full(shape, -1) for e in range(1, config.training.episodes + 1)}
+        for record in self.records:
+            flown[record.episode][record.first : record.tick + 1, record.uav] = record.cells
+        return flown
+
+    def of(self, topic: str, **values: Any) -> list[dict[str, Any]]:
+        """The journal's entries of a topic with these values."""
+        found = [e.values for e in self.entries if e.topic == topic]
+        return [v for v in found if all(v[key] == value for key, value in values.items())]
+
+    def series(self, name: str, episode: int) -> list[float]:
+        """A metric of an episode, one number a tick from 0 on."""
+        return [x for values in self.of("/tmc/metrics", episode=episode) for x in values[name]]
+
+
+class Watched:
+    """A planner whose every sight is kept."""
+
+    def __init__(self, flown: Flown, planner: str) -> None:
+        self._flown, self._planner = flown, PlannerDecider(flown.world, planner)
+        self.pilot: Pilot | None = None
+
+    def choose(self, sight: Sight) -> int:
+        assert self.pilot is not None
+        self._flown.sights[self.pilot.episode, self.pilot.uav, sight.tick] = sight
+        return self._planner.choose(sight)
+
+
+@pytest.fixture(scope="session")
+def fly() -> Callable[..., Flown]:
+    """Fly a mission on a small town; a team of pilot `policy` explores, and is greedy where it does not."""
+
+    def make(settings: dict[str, Any] | None = None) -> Flown:
+        small = {"team.size": 4, "team.pilot": "planner:random-road", "training.episodes": 2, "training.ticks": 37}
+        world = World(build({**small, **(settings or {})}), parse_raster(TOWN))
+        config = world.config
+        learned = config.team.pilot == "policy"
+        station = Station(world, "paper", learning=False, policy=b"a policy" if learned else None)
+        flown = Flown(world, station)
+        table = TrackTable(config.team.size, config.training.ticks)
+        for i in range(config.team.size):
+            watched = Watched(flown, "planner:greedy" if learned else config.team.pilot)
+            planner = None if learned else watched
+            tracks = TableTracks(table, i)
+            watched.pilot = Pilot(world, i, 1, tracks, station.observer, lambda _, w=watched: w, planner)
+            flown.pilots.append(watched.pilot)
+
+        def exchange(uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
+            if isinstance(message, m.Record):
+                flown.records.append(message)
+            station.handle(uav_name(uav), message, 0.0)
+            out = station.out.take()
+            flown.entries += out.entries
+            assert not out.notes
+            replies = [(int(to.removeprefix("uav-")), reply) for to, reply in out.sends]
+            flown.maps += [(i, reply) for i, reply in replies if isinstance(reply, m.Map)]
+            return replies
+
+        fleet = Fleet(flown.pilots, exchange)
+        for pilot in flown.pilots:
+            for i, reply in exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
+                fleet.deliver(i, reply)
+        while fleet.step():
+            pass
+        assert station.phase == "done"
+        return flown
+
+    return make
