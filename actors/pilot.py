@@ -77,7 +77,8 @@ class Pilot:
         """Start an episode, or take a flight up again where the TMC's last record of it ends."""
         if self.phase is not Phase.IDLE and begin.episode == self.episode:
             return None  # a repeat
-        self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, begin.cell, begin.previous
+        track = begin.track.tolist()
+        self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, track[-1], track[-2:][0]
         self.sequence, self.version = begin.sequence, begin.version
         self.airspace.begin(self.episode, self.world.starts(self.episode))
         self._epsilon = self.config.epsilon(self.episode)
@@ -85,13 +86,14 @@ class Pilot:
         self._factor = self.world.initial_factor(self.episode)
         self.last_visit = begin.last_visit.copy()
         self.active = np.zeros(self.world.grid.size, bool)
-        self.visited = set(begin.visited.tolist())
+        self.visited = set(track)
         self.shipped = begin.shipped
         self.leg = Leg(begin.shipped + 1)
         self.pending = None
         if begin.shipped < 0:
             self.leg.cells.append(self.cell)
-        self.airspace.tracks.publish(self.t, self.cell)
+        for tick, cell in enumerate(track):  # a process that was started again says again where it was
+            self.airspace.tracks.publish(tick, cell)
         return self._want(begin.policy, Phase.SENSE)
 
     def on_map(self, answer: Map) -> PolicyRequest | None:

@@ -83,7 +83,8 @@ class Service:
                 message = self._receive()
                 if isinstance(message, m.Welcome):
                     return self._make_pilot(message)
-                self._obey(message)
+                if isinstance(message, m.End | m.Error):
+                    self._obey(message)
         raise Left(process.STOPPED, "stopped before the TMC answered")
 
     def _make_pilot(self, welcome: m.Welcome) -> tuple[Pilot, RadioTracks | None]:
@@ -169,6 +170,8 @@ class Service:
         self._note("ERROR", f"the TMC says: {error.text}")
         if error.code == "fenced":
             raise Left(process.FENCED, error.text)
+        if error.code == "state":  # a TMC that was started again knows nobody
+            self.say(m.Hello("uav", self.uav, self.life))
         if error.code in {"refused", "version"}:
             raise Left(process.USAGE, f"the TMC refused: {error.text}")
 
@@ -177,7 +180,7 @@ class Service:
         start = time.monotonic()
         if self.radio is not None:
             if not self.sock.poll(200):
-                self.radio.ask(waiting.peer, waiting.tick)
+                self.radio.ask(waiting.peer)
             self._listen(0)
         else:
             time.sleep(NAPS[min(tries, len(NAPS) - 1)])

@@ -14,7 +14,8 @@ from deploy.progress import Progress
 from tmc.journal import Journal
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
-from tmc.station import LEARNER, Outbox, Station, uav_name
+from tmc.roster import LEARNER, Outbox, uav_name
+from tmc.station import Station
 from tmc.wire import messages as m
 
 if TYPE_CHECKING:

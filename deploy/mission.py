@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import platform
+import signal
 import sys
 import time
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from actors.tracks import create_table
@@ -79,6 +81,7 @@ class Mission:
 
     def run(self, *, in_one_process: bool) -> int:
         """Fly it; returns the exit code. What it left is in the run folder either way."""
+        signal.signal(signal.SIGTERM, _interrupt)
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
@@ -87,9 +90,9 @@ class Mission:
         except MissionFailed as failed:
             self.progress.note(str(failed))
             return process.FAILED
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stopped:
             self.progress.note(f"stopped; what was flown is in {self.out}")
-            return 130
+            return process.STOPPED if stopped.args else 130
         finally:
             self.progress.clear()
         return process.DONE
@@ -124,6 +127,11 @@ class Mission:
             "seconds": round(time.time() - self._start, 1),
         }
         (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
+
+
+def _interrupt(number: int, _frame: FrameType | None) -> None:
+    """SIGTERM ends a mission in order, as Ctrl-C does."""
+    raise KeyboardInterrupt(number)
 
 
 def command_line() -> str:

@@ -43,7 +43,6 @@ def make(config: Config, out: Path, *, policy: Path | None) -> Plan:
     common = ("--parent", str(os.getpid()), "--out", str(out))
     tmc = [*_module("tmc"), "--config", str(out / "config.json"), "--bind", endpoint, "--tracks", str(tracks), *common]
     tmc += ["--policy", str(policy)] if policy else []
-    tmc += ["--no-learner"] if flies_fixed else []
     children = [Child("tmc", tuple(tmc), restart=False, leads=True)]
     if not flies_fixed:
         children.append(Child("learner", (*_module("learner"), "--connect", endpoint, *common), restart=True))

@@ -21,11 +21,12 @@ from tmc.wire.sockets import EndpointError
 MISTAKES = (ConfigError, MapError, RecordError, EndpointError)
 
 
-def serve(config: Config, endpoint: str, out: Path, *, learning: bool, policy: Path | None, tracks: str) -> int:
-    """Run the TMC of a mission until it is over; returns the exit code."""
+def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, tracks: str) -> int:
+    """Run the TMC of a mission until it is over; returns the exit code. With a fixed policy there is no learner."""
     stop = process.Stop()
     world = World(config)
     run = uuid.uuid4().hex[:12]
+    learning = policy is None and config.team.pilot == "policy"
     station = Station(world, run, learning=learning, policy=policy.read_bytes() if policy else None, tracks=tracks)
     out.mkdir(parents=True, exist_ok=True)
     service = Service(station, Journal(out, world, run), endpoint)
@@ -42,7 +43,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--bind", required=True, help="endpoint for the UAVs; the learner's lies beside it")
     parser.add_argument("--out", type=Path, required=True, help="run folder")
     parser.add_argument("--policy", type=Path, help="fly this policy file; there is no learner")
-    parser.add_argument("--no-learner", action="store_true", help="planners fly; there is no learner")
     parser.add_argument("--tracks", default="", help="track table that UAVs on this machine share")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args(argv)
@@ -50,8 +50,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def start() -> int:
         config = build(json.loads(a.config.read_text()))
-        learning = a.policy is None and not a.no_learner
-        return serve(config, a.bind, a.out, learning=learning, policy=a.policy, tracks=a.tracks)
+        return serve(config, a.bind, a.out, policy=a.policy, tracks=a.tracks)
 
     return process.run(start, MISTAKES)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tmc.kernel.grid import OFF_GRID, STAY
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge, step_events
 from tmc.kernel.world import World
@@ -136,6 +137,15 @@ class Flight:
         targets = self.world.grid.targets[before, r.actions]
         if (np.where(r.blocks == Block.NONE, targets, before) != after).any():
             raise RefusedError(f"record of UAV {r.uav} jumps: a cell does not follow from the action before it")
+        if (self._static_block(targets) != np.where(r.blocks == Block.UAV, 0, r.blocks)).any():
+            raise RefusedError(f"record of UAV {r.uav} says that a move was blocked by what is not there")
+        if (r.actions[r.blocks == Block.UAV] == STAY).any():
+            raise RefusedError(f"record of UAV {r.uav} says that another UAV kept it from staying where it is")
+
+    def _static_block(self, targets: NDArray[np.int32]) -> NDArray[np.int64]:
+        """What the map says of moves: Block.GRID, Block.OBSTACLE or 0."""
+        obstacle = np.where(self.world.map.blocked[np.maximum(targets, 0)], int(Block.OBSTACLE), 0)
+        return np.where(targets == OFF_GRID, int(Block.GRID), obstacle)
 
     def exchanges(self) -> list[Exchange]:
         """Run the exchange clock as far as the records allow; one entry for each that could be held."""

@@ -7,13 +7,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+from tmc.entries import Entry
 from tmc.kernel.config import flat
 from tmc.kernel.world import World
 from tmc.record import builders
 from tmc.record.channels import CHANNELS
 from tmc.record.schemas import message_class
 from tmc.record.writer import LogWriter
-from tmc.station import Entry, Outbox
+from tmc.roster import Outbox
 
 _SCHEMA = {c.topic: c.schema for c in CHANNELS}
 

@@ -56,7 +56,8 @@ class Replay:
         team, ticks = config.team.size, config.training.ticks
         self._starts_kept = max(1, config.replay.capacity // team)
         episodes = self._starts_kept // ticks + 2
-        rows = self._starts_kept + self.n_step + episodes + 1
+        # Behind the oldest start, the rows since the last exchange are kept too: its local updates are in them.
+        rows = self._starts_kept + self.n_step + config.T_u + episodes + 1
         R = world.law.cells.size
         self._events = config.scenario == 1
         frames = (rows // config.T_u + 4 * (episodes + 1)) * (1 if config.comms.phase == "together" else team)

@@ -9,7 +9,8 @@ from typing import Any
 import zmq
 
 from tmc.journal import Journal
-from tmc.station import LEARNER, Outbox, Station
+from tmc.roster import LEARNER, Outbox
+from tmc.station import Station
 from tmc.wire import sockets
 from tmc.wire.codec import CodecError, decode
 from tmc.wire.messages import Bye, End

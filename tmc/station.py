@@ -6,64 +6,20 @@ argument and randomness is addressed, so playing the same messages again gives t
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
+from tmc import entries
 from tmc.flight import Exchange, Flight, RefusedError, Truth
 from tmc.kernel.config import flat
 from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.world import World
 from tmc.limiter import Limiter
-from tmc.record.channels import uav_topic
 from tmc.replay import Replay
+from tmc.roster import LEARNER, Member, Outbox, uav_name
 from tmc.wire import messages as m
-
-LEARNER = "learner"
-
-
-def uav_name(i: int) -> str:
-    """The address of UAV i's process."""
-    return f"uav-{i:03d}"
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A journal entry: the topic, and the fields of its schema (docs/log-format.md)."""
-
-    topic: str
-    values: dict[str, Any]
-
-
-@dataclass
-class Outbox:
-    """What the core wants done: messages to send, entries to journal, notes for the log. The service empties it."""
-
-    sends: list[tuple[str, m.Message]] = field(default_factory=list)
-    entries: list[Entry] = field(default_factory=list)
-    notes: list[tuple[str, str]] = field(default_factory=list)
-
-    def take(self) -> Outbox:
-        """All of it; this outbox is empty afterwards."""
-        taken = Outbox(self.sends, self.entries, self.notes)
-        self.sends, self.entries, self.notes = [], [], []
-        return taken
-
-
-@dataclass
-class Member:
-    """A UAV on the roster: its process's life, when it was last heard of, and the answer it last got."""
-
-    life: int = -1
-    heard: float = 0.0
-    sequence: int = 0
-    answer: m.Map | None = None
-    named: bool = False
 
 
 class Station:
@@ -74,11 +30,11 @@ class Station:
     ) -> None:
         config = world.config
         self.world, self.config, self.run, self.tracks = world, config, run, tracks
-        self.learning = learning
+        self.learning = learning and policy is None and config.team.pilot == "policy"
         self.observer = Observer(world)
         self.replay = Replay(world, self.observer)
         self.reward = RewardLaw(config, world.law.q)
-        ratio = config.replay.updates_per_tick if learning else 0.0
+        ratio = config.replay.updates_per_tick if self.learning else 0.0
         self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
         self.roster = [Member() for _ in range(config.team.size)]
         self.flight: Flight | None = None
@@ -91,7 +47,7 @@ class Station:
         self.out = Outbox()
         self._held: list[tuple[str, m.Message]] = []
         self._requests: list[int] = []
-        self._ended = False
+        self._ended = self._learner_told = False
         if policy is not None:
             self._take_policy(1, policy, 0, 0.0)
 
@@ -109,7 +65,8 @@ class Station:
     def status(self) -> m.Status:
         """Progress, for whoever asks."""
         flight = self.flight
-        waiting = ", ".join(self.waiting_for())
+        names = self.waiting_for()
+        waiting = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
         return m.Status(
             self.phase, flight.episode if flight else self.episodes, max(flight.done, 0) if flight else 0, self.ticks,
             self.limiter.updates, self.policy_version, self.loss, self.uncertainty, self.episode_uncertainty,
@@ -146,18 +103,22 @@ class Station:
         config = json.dumps(flat(self.config))
         welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks, self.policy_version)
         if hello.role == "learner":
-            if not self.learning:
-                self.reject(sender, "refused", "this mission has no learner: it flies a fixed policy")
+            if not self.learning or sender != LEARNER:
+                self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
                 return
             self._learner_hello(sender, hello, welcome)
             return
-        if not 0 <= hello.uav < len(self.roster):
-            self.reject(sender, "refused", f"there is no UAV {hello.uav} in a team of {len(self.roster)}")
+        if not 0 <= hello.uav < len(self.roster) or sender != uav_name(hello.uav):
+            self.reject(sender, "refused", f"{sender} is no name for UAV {hello.uav} of a team of {len(self.roster)}")
             return
         member = self.roster[hello.uav]
+        if hello.life in member.past:
+            self.reject(sender, "fenced", f"a newer process flies {sender}: leave")
+            return
         if member.life not in {-1, hello.life}:
+            member.past.add(member.life)
             self.out.notes.append(("WARNING", f"{sender} is back with a new process"))
-        member.life, member.heard = hello.life, now
+        member.life, member.heard, member.named = hello.life, now, False
         self._send(sender, welcome)
         if self.phase == "done" or self._ended:
             self._send(sender, m.End("the mission is over"))
@@ -168,17 +129,22 @@ class Station:
 
     def _learner_hello(self, sender: str, hello: m.Hello, welcome: m.Welcome) -> None:
         """A learner is here, perhaps back from an older checkpoint: what it lost since is owed to it again."""
+        self._requests.clear()  # it asks again once it is welcome
         if hello.life != self.learner_life:
-            self.learner_life = hello.life
-            self._requests.clear()
+            self.learner_life, self._learner_told = hello.life, False
             self.limiter.updates = min(self.limiter.updates, hello.updates)
         self._send(sender, welcome)
+        if self._ended:
+            self._finish_if_done()
 
     def _record(self, sender: str, record: m.Record, now: float) -> None:
         if not 0 <= record.uav < len(self.roster) or uav_name(record.uav) != sender:
             self.reject(sender, "refused", f"{sender} cannot ship a record of UAV {record.uav}")
             return
         member = self.roster[record.uav]
+        if member.life < 0:
+            self.reject(sender, "state", f"{sender} is not known here: say hello first")
+            return
         if record.life != member.life:
             self.reject(sender, "fenced", f"a newer process flies {sender}: leave")
             return
@@ -201,7 +167,7 @@ class Station:
             self.reject(sender, "refused", str(refused))
             return
         member.sequence += 1
-        self.out.entries.append(Entry(uav_topic(record.uav, "record"), {"record": record}))
+        self.out.entries.append(entries.flight_record(record))
         for exchange in flight.exchanges():
             self._answer(flight, exchange)
         self._journal_truth(flight, flight.settle())
@@ -212,25 +178,13 @@ class Station:
 
     def _answer(self, flight: Flight, exchange: Exchange) -> None:
         self.version = exchange.version
-        values = {
-            "episode": flight.episode, "tick": exchange.tick, "version": exchange.version,
-            "policy": self.policy_version, "uavs": exchange.uavs, "believed": exchange.believed,
-        }  # fmt: skip
-        self.out.entries.append(Entry("/tmc/sync", values))
-        if flight.scenario == 2:
-            self.out.entries.append(Entry("/tmc/last_visit", {"last_visit": self._whole(exchange.last_visit)}))
+        self.out.entries += entries.exchange(flight, exchange, self.policy_version)
         for i in exchange.uavs:
             answer = m.Map(
                 flight.episode, exchange.tick, exchange.version, self.policy_version, self.roster[i].sequence - 1,
                 exchange.last_visit, exchange.active,
             )  # fmt: skip
             self._held.append((uav_name(i), answer))
-
-    def _whole(self, last_visit: np.ndarray[Any, np.dtype[np.uint16]]) -> np.ndarray[Any, np.dtype[np.uint32]]:
-        """Last visits over all K cells."""
-        whole = np.zeros(self.world.grid.size, np.uint32)
-        whole[self.world.law.cells] = last_visit
-        return whole
 
     def _journal_truth(self, flight: Flight, truth: Truth) -> None:
         if not truth.uncertainty:
@@ -239,17 +193,8 @@ class Station:
         self.ticks += moves
         self.limiter.insert(moves, len(self.replay))
         self.uncertainty = truth.uncertainty[-1]
-        self.out.entries.append(
-            Entry("/tmc/metrics", {
-                "episode": flight.episode, "first": truth.first, "steps": self.ticks * flight.N,
-                "updates": self.limiter.updates, "policy": self.policy_version,
-                "uncertainty": truth.uncertainty, "reward": [float(r.mean()) for r in truth.reward],
-            })
-        )  # fmt: skip
-        if truth.events:
-            ticks, cells = zip(*truth.events, strict=True)
-            values = {"episode": flight.episode, "ticks": list(ticks), "cells": list(cells)}
-            self.out.entries.append(Entry("/tmc/events", values))
+        steps, updates = self.ticks * flight.N, self.limiter.updates
+        self.out.entries += entries.truth(flight, truth, steps, updates, self.policy_version)
 
     # Episodes.
 
@@ -272,10 +217,9 @@ class Station:
         """Fly from the last record that the TMC has; at the start of an episode, from its beginning."""
         shipped = flight.reported[i]
         tick = max(shipped, 0)
-        visited = np.unique(flight.cells[: tick + 1, i]).astype("<u2")
         return m.Begin(
-            flight.episode, tick, int(flight.cells[tick, i]), int(flight.cells[max(tick - 1, 0), i]), shipped,
-            self.roster[i].sequence, flight.version, self.policy_version, flight.beliefs[i].copy(), visited,
+            flight.episode, tick, shipped, self.roster[i].sequence, flight.version, self.policy_version,
+            flight.beliefs[i].copy(), flight.cells[: tick + 1, i].copy(),
         )  # fmt: skip
 
     def _resume(self, i: int) -> None:
@@ -298,28 +242,21 @@ class Station:
             self._finish_if_done()
 
     def _journal_episode(self, flight: Flight, phase: str) -> None:
-        mean = flight.total_uncertainty / flight.T
-        self.out.entries.append(
-            Entry("/tmc/episode", {
-                "episode": flight.episode, "phase": phase, "starts": flight.starts, "ticks": max(flight.done, 0),
-                "uncertainty": mean, "uncertainty_per_cell": mean / self.world.law.cells.size,
-                "reward": [float(r) for r in flight.total_reward], "blocked_grid": flight.blocked[Block.GRID],
-                "blocked_obstacle": flight.blocked[Block.OBSTACLE], "blocked_uav": flight.blocked[Block.UAV],
-                "epsilon": self.config.epsilon(flight.episode), "updates": self.limiter.updates,
-                "steps": self.ticks * flight.N,
-            })
-        )  # fmt: skip
+        steps, updates, epsilon = self.ticks * flight.N, self.limiter.updates, self.config.epsilon(flight.episode)
+        self.out.entries.append(entries.episode(flight, phase, epsilon, steps, updates))
 
     def _finish_if_done(self) -> None:
-        """Send everybody home: the UAVs when the last episode is over, the learner when it has caught up."""
-        if self.phase == "learning" and self.learner_life >= 0:
+        """Send everybody home once the last episode is over and the learner has caught up."""
+        if self.phase != "done":
             return
+        goodbye = m.End("the mission is over")
+        if self.learning and not self._learner_told:
+            self._learner_told = True
+            self._send(LEARNER, goodbye)
         if not self._ended:
             self._ended = True
-            for i in range(len(self.roster)):
-                self._held.append((uav_name(i), m.End("the mission is over")))
-            if self.learning:
-                self._send(LEARNER, m.End("the mission is over"))
+            self._held += [(uav_name(i), goodbye) for i in range(len(self.roster))]
+            self._release()
 
     # Answers held back by the limiter.
 
@@ -356,8 +293,7 @@ class Station:
                 s.next_observation, s.discount, s.allowed,
             ))  # fmt: skip
         self._release()
-        if self._requests and self.phase == "done":
-            self._finish_if_done()
+        self._finish_if_done()
 
     def _policy_push(self, sender: str, push: m.PolicyPush, _now: float) -> None:
         if sender != LEARNER or not self.learning:
@@ -376,9 +312,7 @@ class Station:
         needed = {version} | {a.policy for a in (member.answer for member in self.roster) if a is not None}
         needed |= {a.policy for _, a in self._held if isinstance(a, m.Map | m.Begin)}
         self.policies = {v: p for v, p in self.policies.items() if v in needed}
-        digest = hashlib.sha256(model).hexdigest()
-        values = {"version": version, "updates": updates, "sha256": digest, "loss": loss}
-        self.out.entries.append(Entry("/learner/policy", values))
+        self.out.entries.append(entries.policy(version, updates, loss, model, last=self._ended))
 
     def _policy_request(self, sender: str, request: m.PolicyRequest, _now: float) -> None:
         # Superseded since it was named: the newest is the one to fly, and the record will say so.

@@ -18,7 +18,7 @@ from deploy import lockstep, settings, who
 from deploy.mission import bound_of, check
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.world import World
-from tmc.station import Outbox
+from tmc.roster import Outbox
 
 FIRST_SEED = 1_000_000
 """Seeds of an evaluation start here, far from those that people train with."""

@@ -40,4 +40,4 @@ def main(args: argparse.Namespace) -> int:
         path.parent.mkdir()
         path.write_bytes(policy)
     print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
-    return serve(config, args.bind, out, learning=not args.fly, policy=path, tracks="")
+    return serve(config, args.bind, out, policy=path, tracks="")

@@ -1,6 +1,7 @@
 """`overfly analyze`: the summary on the screen or as JSON, the pictures, and mistakes in one sentence."""
 
 import json
+import subprocess
 import sys
 
 import pytest
@@ -32,10 +33,9 @@ def test_json_is_all_of_stdout_and_the_file(run, capsys):
 
 
 def test_an_episode_may_be_chosen(run, capsys):
+    last = (run / "report" / "paths.png").read_bytes()  # flying made it
     assert main(["analyze", str(run), "--episode", "1"]) == 0
-    first = (run / "report" / "paths.png").read_bytes()
-    assert main(["analyze", str(run), "--episode", "2"]) == 0
-    assert (run / "report" / "paths.png").read_bytes() != first
+    assert (run / "report" / "paths.png").read_bytes() != last
 
 
 def test_without_matplotlib_it_says_how_to_install_it_and_goes_on(run, capsys, monkeypatch):
@@ -88,7 +88,5 @@ def test_a_run_without_flights(run, tmp_path, capsys):
 
 
 def test_matplotlib_is_imported_only_for_pictures():
-    import subprocess
-
     code = "import sys, deploy.commands.analyze, deploy.commands.map; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

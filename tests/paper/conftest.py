@@ -18,7 +18,8 @@ from actors.tracks import TableTracks, TrackTable
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
-from tmc.station import Entry, Station, uav_name
+from tmc.roster import uav_name
+from tmc.station import Station
 from tmc.wire import messages as m
 
 TOWN = """\
@@ -40,7 +41,7 @@ class Flown:
     pilots: list[Pilot] = field(default_factory=list)
     records: list[m.Record] = field(default_factory=list)
     maps: list[tuple[int, m.Map]] = field(default_factory=list)
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[Any] = field(default_factory=list)
     sights: dict[tuple[int, int, int], Sight] = field(default_factory=dict)
 
     @cached_property

@@ -15,12 +15,14 @@ from actors.pilot import Phase, Pilot
 from actors.planners import PlannerDecider, Sight
 from actors.radio import RadioTracks
 from actors.tracks import TableTracks, TrackTable
+from tmc.entries import Entry
 from tmc.kernel.config import build
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Observer
 from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
 from tmc.kernel.world import World
-from tmc.station import Entry, Station, uav_name
+from tmc.roster import uav_name
+from tmc.station import Station
 from tmc.wire import messages as m
 
 RASTER = """\
@@ -41,7 +43,7 @@ class Paused(Exception):  # noqa: N818  it is no error: the pilot has flown one 
 
 
 class Wanderer:
-    """Half of the time towards the middle of the map, where the others are too; otherwise anywhere, blocked or not."""
+    """Half of the time towards the middle, where the others are too; otherwise anywhere, blocked or not."""
 
     def __init__(self, world: World) -> None:
         self.grid = world.grid
@@ -56,7 +58,7 @@ class Wanderer:
 
 
 class SpyPilot(Pilot):
-    """A pilot that notes, at each tick, the observation and the actions that it may choose, and pauses after each move."""
+    """Notes, at each tick, the observation and the actions that it may choose, and pauses after each move."""
 
     seen: dict[tuple[int, int, int], tuple[np.ndarray[Any, Any], list[int]]]
 
@@ -191,7 +193,7 @@ class Mission:
                 continue
             tracks = pilot.airspace.tracks
             if i in self.waits and isinstance(tracks, RadioTracks):
-                tracks.ask(self.waits[i].peer, self.waits[i].tick)
+                tracks.ask(self.waits[i].peer)
                 self.asked += 1
             if pilot.phase is Phase.MAP and pilot.pending is not None:
                 self.up[i].append(pilot.pending)
@@ -209,13 +211,13 @@ class Mission:
         self.up[i].append(m.Hello("uav", i, self.lives[i]))
 
     def steps(self, rng: Random | None = None, crash: float = 0.0) -> Iterator[tuple[str, int]]:
-        """Let things happen until all UAVs are home, and yield after each; without `rng` in a fixed order."""
+        """Let things happen until all UAVs are home, and yield after each; without `rng` in a fixed order.
+
+        `crash` is the chance that the process of a UAV is lost when it was about to fly.
+        """
         stuck: set[int] = set()
         silences = 0
         while len(self.home) < self.N:
-            if rng is not None and crash and rng.random() < crash:
-                self.lose(rng.randrange(self.N), on_the_air=rng.random() < 0.5)
-                stuck.clear()
             choices = self.choices(stuck)
             if not choices:
                 silences += 1
@@ -224,6 +226,10 @@ class Mission:
                 stuck.clear()
                 continue
             what, i = rng.choice(choices) if rng is not None else choices[0]
+            if rng is not None and what == "fly" and rng.random() < crash:
+                self.lose(i, on_the_air=rng.random() < 0.5)
+                stuck.clear()
+                continue
             if self.happen(what, i):
                 stuck.clear()
                 self.waits.clear()

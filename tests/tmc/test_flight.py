@@ -214,7 +214,7 @@ def test_no_two_uavs_share_a_cell(case: tuple[Any, Flight, Referee]) -> None:
 @pytest.mark.parametrize("initial", ["visited", "random"])
 @pytest.mark.parametrize("rates", ["uniform", "volume"])
 def test_the_accounting_identity(mission: Callable[..., Any], toronto: RoadMap, initial: str, rates: str) -> None:
-    """sum_t u_k(t) = F_k - sum_v u_k(t_v before) (1 - q^(T - t_v + 1)) / (1 - q), for every cell k (DESIGN section 2)."""
+    """sum_t u_k(t) = F_k - sum_v u_k(t_v before) (1 - q^(T - t_v + 1)) / (1 - q) over all cells (DESIGN section 2)."""
     T, N = 150, 4
     values = {"team.size": N, "training.ticks": T, "world.initial_map": initial, "world.rates": rates}
     flown = mission({**values, "team.pilot": "planner:greedy"}, toronto).play(Random(1))
@@ -310,7 +310,7 @@ def test_answers_and_truth_do_not_depend_on_the_order_of_arrival(shipped: Shippe
     for name in ("uncertainty", "reward", "events"):
         ours, theirs = ([x for truth in t for x in getattr(truth, name)] for t in (truths, truths_then))
         assert [np.asarray(x).tolist() for x in ours] == [np.asarray(x).tolist() for x in theirs]
-    assert [t.first for t in truths if t.uncertainty][0] == 0
+    assert next(t.first for t in truths if t.uncertainty) == 0
     rows = np.repeat(np.arange(34), 4)
     uavs = np.tile(np.arange(4), 34)
     assert flight.replay.belief(rows, uavs).tobytes() == then.replay.belief(rows, uavs).tobytes()
@@ -407,7 +407,7 @@ MALFORMED: dict[str, tuple[Callable[[Record, Flight], Record], str]] = {
     "a sighting off the grid": (seen([8], [108]), "sighting off the grid"),
     "blocked by no edge": (claims(Block.GRID, free_move), "block"),
     "blocked by no obstacle": (claims(Block.OBSTACLE, free_move), "block"),
-    "blocked while it stays": (claims(Block.UAV, lambda w, c: 8), "block"),
+    "blocked while it stays": (claims(Block.UAV, lambda w, c: 8), "kept it from staying"),
 }
 
 
@@ -425,9 +425,7 @@ def state(flight: Flight) -> bytes:
 
 
 @pytest.mark.parametrize("why", list(MALFORMED))
-def test_a_malformed_record_is_refused_and_changes_nothing(
-    halfway: tuple[World, list[list[Record]]], why: str
-) -> None:
+def test_a_malformed_record_is_refused_and_changes_nothing(halfway: tuple[World, list[list[Record]]], why: str) -> None:
     world, queues = halfway
     flight = fresh(world)
     for place in range(2):

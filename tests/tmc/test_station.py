@@ -16,7 +16,8 @@ from tmc.kernel.config import Config, build, flat
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
-from tmc.station import LEARNER, Station, uav_name
+from tmc.roster import LEARNER, uav_name
+from tmc.station import Station
 from tmc.wire import messages as m
 from tmc.wire.codec import encode
 
@@ -111,8 +112,8 @@ def test_the_episode_begins_when_everybody_is_here(station_of: Callable[..., Sta
     for i in range(2):
         begin = sends[1 + i][1]
         assert isinstance(begin, m.Begin)
-        assert (begin.episode, begin.tick, begin.cell, begin.shipped, begin.sequence) == (1, 0, starts[i], -1, 0)
-        assert begin.visited.tolist() == [starts[i]] and not begin.last_visit.any()
+        assert (begin.episode, begin.tick, begin.shipped, begin.sequence) == (1, 0, -1, 0)
+        assert begin.track.tolist() == [starts[i]] and not begin.last_visit.any()
 
 
 def test_the_welcome_holds_the_whole_mission(station_of: Callable[..., Station]) -> None:
@@ -158,8 +159,8 @@ def test_planners_do_not_wait_for_the_learner(station_of: Callable[..., Station]
 
 def test_strangers_are_refused(station_of: Callable[..., Station]) -> None:
     station = station_of()
-    rejects(station, "uav-002", m.Hello("uav", 2, 1), "refused", "no UAV 2 in a team of 2")
-    rejects(station, "uav-000", m.Hello("uav", -1, 1), "refused", "no UAV -1")
+    rejects(station, "uav-002", m.Hello("uav", 2, 1), "refused", "UAV 2")
+    rejects(station, "uav-000", m.Hello("uav", -1, 1), "refused", "UAV -1")
     rejects(station, LEARNER, m.Hello("learner", -1, 1), "refused", "no learner")
     rejects(station, "observer-1", m.PolicyRequest(1), "state", "no policy 1")
     for message in (m.Ack(1), m.End("x"), m.Welcome("", "", "", "", 0), m.Error("state", "x")):
@@ -531,7 +532,7 @@ def test_a_mission_without_a_learner_ends_with_its_last_record(mission: Callable
 def test_the_same_messages_give_the_same_answers(mission: Callable[..., Any], town: RoadMap) -> None:
     """The core is pure: playing what it heard through another one gives the same frames and the same journal."""
     values = {"team.size": 3, "training.ticks": 30, "training.episodes": 2, "comms.phase": "staggered"}
-    flown = mission(values, town).play(Random(4), crash=0.01)
+    flown = mission(values, town).play(Random(4), crash=0.03)
     again = mission(values, town)
     for sender, message in flown.heard:
         again.tell(sender, message)
@@ -559,7 +560,7 @@ def test_lost_uavs_come_back_and_fly_the_same_cells(
     """Processes die at random ticks, with their records lost or not: the journal holds the undisturbed flight."""
     values = {"team.size": 4, "training.ticks": 40, "training.episodes": 2, **PILOTS[pilots]}
     calm = mission(values, town).play()
-    rough = mission(values, town).play(Random(seed), crash=0.015)
+    rough = mission(values, town).play(Random(seed), crash=0.03)
     assert sum(rough.lives) > 4 + 3, "nobody was lost"
     assert rough.flown() == calm.flown()
     uncertainty = [[e.values["uncertainty"] for e in f.entries if e.topic == "/tmc/episode"] for f in (calm, rough)]
@@ -571,7 +572,7 @@ def test_lost_uavs_come_back_and_fly_the_same_cells(
 
 
 def test_a_uav_comes_back_to_the_knowledge_that_it_had(mission: Callable[..., Any], town: RoadMap) -> None:
-    """Begin at the tick of the last record: the cell, the own visits, the map, and the answer if there is one."""
+    """Begin at the tick of the last record: the own track, the map, and the answer if there is one."""
     flown = mission({"team.size": 2, "training.ticks": 40, "comms.period": 10}, town)
     for _ in flown.steps():
         if flown.pilots[0].t == 14:
@@ -582,9 +583,8 @@ def test_a_uav_comes_back_to_the_knowledge_that_it_had(mission: Callable[..., An
     assert kinds(sends) == [("uav-000", n) for n in ("Welcome", "Begin", "Map")]
     begin = sends[1][1]
     assert isinstance(begin, m.Begin)
-    assert (begin.tick, begin.shipped, begin.sequence, begin.cell) == (10, 10, 2, track[10])
-    assert begin.previous == track[9]
-    assert set(begin.visited.tolist()) == set(track[:11])
+    assert (begin.tick, begin.shipped, begin.sequence) == (10, 10, 2)
+    assert begin.track.tolist() == track[:11]
     assert sends[2][1].tick == 10  # type: ignore[attr-defined]
     others = [c for r in flown.records if r.uav == 1 for c in r.cells.tolist()][:11]
     newest = {c: t for t, pair in enumerate(zip(track, others, strict=True)) for c in pair}
@@ -606,11 +606,9 @@ def test_uavs_with_beacons_fly_the_same_cells(
 
 @pytest.mark.parametrize("scenario", [1, 2])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_lost_uavs_with_beacons_come_back(
-    mission: Callable[..., Any], town: RoadMap, scenario: int, seed: int
-) -> None:
-    """What a process knew of the others, and what the others had not heard of it, is lost with it; so it is asked for."""
-    values = {"team.size": 4, "training.ticks": 40, "training.episodes": 2, "scenario": scenario}
-    flown = mission(values, town, radio=True).play(Random(seed), crash=0.01)
-    assert sum(flown.lives) > 4
+def test_lost_uavs_with_beacons_come_back(mission: Callable[..., Any], town: RoadMap, scenario: int, seed: int) -> None:
+    """What a process knew of the others, and they had not heard of it, is lost with it; so it is asked for."""
+    values = {"team.size": 3, "training.ticks": 30, "scenario": scenario}
+    flown = mission(values, town, radio=True).play(Random(seed), crash=0.02)
+    assert sum(flown.lives) > 3
     assert flown.flown() == mission(values, town).play().flown()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from tmc.analysis import style
@@ -57,7 +57,7 @@ def curves_picture(flown: Flown, summary: Summary, path: Path, baselines: Mappin
 
 
 def _period(m: Mission) -> str:
-    return f"$T_u$ = {m.T_u} tick" + ("" if m.T_u == 1 else "s")
+    return f"T_u = {m.T_u} tick" + ("" if m.T_u == 1 else "s")
 
 
 def _by_episode(summary: Summary, name: str) -> tuple[list[int], list[float]]:
@@ -114,7 +114,7 @@ def _learning_curve(axes: Any, learning: Learning) -> None:
         return
     lines = axes.plot(x, _thin(learning.loss), color=style.BLUE, linewidth=0.7, label="loss (left)")
     if (learning.loss > 0).any():
-        axes.set_yscale("log")
+        _log_scale(axes)
     if np.isfinite(learning.q_mean).any():
         right = axes.twinx()
         right.spines["top"].set_visible(False)
@@ -123,6 +123,15 @@ def _learning_curve(axes: Any, learning: Learning) -> None:
         target = _thin(learning.target_mean)
         lines += right.plot(x, target, color=style.BLACK, linewidth=0.8, linestyle=":", label="mean target (right)")
     axes.legend(handles=lines, frameon=False, fontsize=8)
+
+
+def _log_scale(axes: Any) -> None:
+    """A logarithmic axis with plain numbers, between the decades too where there are fewer than two of these."""
+    axes.set_yscale("log")
+    low, high = np.log10(axes.get_ylim())
+    decades = np.floor(high) - np.ceil(low) + 1
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}") if decades < 2 else NullFormatter())
 
 
 def _thin(values: NDArray[Any]) -> NDArray[Any]:

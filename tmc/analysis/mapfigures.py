@@ -130,12 +130,11 @@ def _north(axes: Any) -> None:
 
 
 def _grid_lines(axes: Any, road_map: RoadMap) -> None:
-    """Thin lines between cells, where cells are large enough to see them."""
-    if max(road_map.grid.rows, road_map.grid.cols) <= 60:
-        axes.set_xticks(np.arange(1, road_map.grid.cols) * road_map.cell_m, minor=True)
-        axes.set_yticks(np.arange(1, road_map.grid.rows) * road_map.cell_m, minor=True)
-        axes.grid(which="minor", color="white", linewidth=0.5)
-        axes.tick_params(which="minor", length=0)
+    """Thin lines between cells, where cells are large enough to see them; minor ticks would cost half a second."""
+    rows, cols, width = road_map.grid.rows, road_map.grid.cols, road_map.cell_m
+    if max(rows, cols) <= 60:
+        axes.vlines(np.arange(1, cols) * width, 0, rows * width, color="white", linewidth=0.5)
+        axes.hlines(np.arange(1, rows) * width, 0, cols * width, color="white", linewidth=0.5)
 
 
 def _cells_image(axes: Any, road_map: RoadMap, values: NDArray[Any], **how: Any) -> Any:

@@ -47,6 +47,8 @@ class World:
             )
         if size > self.start_cells.size:
             raise ConfigError(f"team.size = {size} is larger than the {self.start_cells.size} cells to start on")
+        if self.config.replay.capacity < size:
+            raise ConfigError(f"replay.capacity = {self.config.replay.capacity} is less than a tick of {size} UAVs")
         if not self.law.cells.size:
             raise ConfigError(f"no cell of {self.map.name} is monitored: every rate is 0")
 

@@ -58,20 +58,18 @@ class Welcome(Message):
 class Begin(Message):
     """Fly from here: a new episode (`shipped` = -1, tick 0), or the flight of a lost process taken up again.
 
-    `previous` is the cell of the tick before (at tick 0 the start). `last_visit` (u16, one a monitored cell) and
-    `visited` (u16, cells of own visits) are the UAV's knowledge at `tick`.
+    `track` (u16) is the UAV's own flight so far, a cell for each of the ticks 0..`tick`; `last_visit` (u16, one a
+    monitored cell) is what it knew of the map at `tick`.
     """
 
     episode: int = f.integer(1, 2**31 - 1)
     tick: int = f.integer(0, 65_535)
-    cell: int = f.integer(0, 65_535)
-    previous: int = f.integer(0, 65_535)
     shipped: int = f.integer(-1, 65_535)
     sequence: int = f.integer(0, 2**62)
     version: int = f.integer(0, 2**62)
     policy: int = f.integer(0, 2**62)
     last_visit: Array = f.array("<u2", 65_535)
-    visited: Array = f.array("<u2", 65_535)
+    track: Array = f.array("<u2", 65_535)
 
 
 @dataclass(frozen=True)
@@ -177,7 +175,7 @@ class Ack(Message):
 class Beacon(Message):
     """UAV `uav` stood on `cells` at `tick` and the ticks after it; the TMC passes it on to the UAVs in `to`.
 
-    `ask` >= 0: and please tell me your own track from tick `ask` on.
+    `ask` >= 0: and please tell me your own track from tick `ask` on. `cells` may be empty then.
     """
 
     uav: int = f.integer(0, 65_535)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,30 +11,19 @@ import pytest
 
 from deploy.lockstep import run
 from deploy.progress import Progress
-from tmc.kernel.config import build, flat
+from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
+from tmc.record import schemas
+from tmc.record.writer import LogWriter
 
 SMALL = {
     "training.ticks": 60,
     "training.seed": 3,
+    "training.episodes": 1,
     "team.size": 3,
-    "team.pilot": "planner:greedy",
-    "exploration.start": 0.4,
-    "exploration.end": 0.4,
+    "team.pilot": "planner:random",
 }
-"""With exploration, so that moves are blocked for every cause."""
-LEARNING = {
-    **SMALL,
-    "team.pilot": "policy",
-    "training.episodes": 3,
-    "training.push_every": 10,
-    "dqn.batch": 8,
-    "replay.learn_start": 16,
-    "observation.view": "ego",
-    "observation.radius": 4,
-    "network.channels": [4],
-    "network.dense": 8,
-}
+"""At random, so that moves are blocked for every cause, and UAVs leave the roads."""
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +46,14 @@ def fly(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def learned(fly: Callable[..., Path]) -> Path:
-    """A short training run."""
-    return fly(**LEARNING)
+def learned(fly: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that looks like training, without torch: three random episodes, and the log of a learner."""
+    folder = tmp_path_factory.mktemp("learned") / "run"
+    shutil.copytree(fly(**{"training.episodes": 3}), folder)
+    config = json.loads((folder / "config.json").read_text()) | {"team.pilot": "policy"}
+    (folder / "config.json").write_text(json.dumps(config))
+    with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
+        for n in range(1, 181):
+            metrics = schemas.LearnerMetrics(updates=n, loss=1 / n, q_mean=n / 20, target_mean=n / 19)
+            log.write("/learner/metrics", metrics)
+    return folder

@@ -17,7 +17,7 @@ from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
-SCENARIO_1 = {"scenario": 1, "training.episodes": 2, "world.alpha": 0.2}
+SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 
 
 def world_of(folder):
@@ -61,7 +61,7 @@ def test_roads_come_from_the_cells_flown(fly):
 
 
 def test_blocked_moves_and_reward_are_those_of_the_episodes(fly):
-    folder = fly(**{"training.episodes": 2, "team.pilot": "planner:random", "team.size": 12})
+    folder = fly(**{"training.episodes": 2, "team.size": 12})
     s = summary(folder)
     ends = [e for e in facts.episodes(folder) if e.phase == "end"]
     assert (s.blocked_grid, s.blocked_obstacle, s.blocked_uav) == tuple(
@@ -170,6 +170,7 @@ def test_an_active_log_is_noted_as_such(fly, tmp_path):
 
 def test_learner_metrics_count_the_last_time_they_were_done(learned, tmp_path):
     folder = copy_of(learned, tmp_path)
+    (folder / "learner.mcap").unlink()
     with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
         for updates, loss in ((10, 1.0), (20, 2.0), (500, 3.0), (20, 7.0)):
             log.write(
@@ -179,6 +180,21 @@ def test_learner_metrics_count_the_last_time_they_were_done(learned, tmp_path):
     assert learning.updates.tolist() == [10, 20, 500] and learning.loss.tolist() == [1.0, 7.0, 3.0]
     s = summary(folder)
     assert (s.pace.updates, s.pace.loss, s.pace.q_mean) == (500, 3.0, 3.0)
+
+
+def test_without_the_learners_log_the_tmc_knows_its_policies(learned, tmp_path):
+    folder = tmp_path / "tmc-host"
+    folder.mkdir()
+    shutil.copy(learned / "config.json", folder)
+    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+        for version, (updates, loss) in enumerate(((0, 0.0), (100, 0.5), (150, 0.25)), 1):
+            log.write("/learner/policy", schemas.Policy(version=version, updates=updates, loss=loss))
+        for entry in Log(learned / "tmc.mcap").entries():
+            log.write(entry.topic, entry.message)
+    s = summary(folder)
+    assert s.mission.learning and (s.pace.updates, s.pace.loss, s.pace.q_mean) == (150, 0.25, None)
+    assert read(folder).learning.updates.tolist() == [100, 150]
+    assert s.episodes == summary(learned).episodes
 
 
 def test_an_empty_log_of_another_process_is_a_note(fly, tmp_path):

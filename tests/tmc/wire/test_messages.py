@@ -35,8 +35,8 @@ EXAMPLES: tuple[Message, ...] = (
     m.Hello("learner", -1, 2**63 - 1, updates=7),
     m.Welcome('{"team.size": 3}', "ab" * 32, "run-1", "/tmp/tracks", 4),
     m.Begin(
-        episode=1, tick=0, cell=17, previous=17, shipped=-1, sequence=0, version=0, policy=1,
-        last_visit=numbers("<u2", 0, 0), visited=numbers("<u2", 17),
+        episode=1, tick=1, shipped=-1, sequence=0, version=0, policy=1,
+        last_visit=numbers("<u2", 0, 1), track=numbers("<u2", 17, 18),
     ),
     m.Record(
         2, 12345, 3, 1, 1, 2, 5, 4, numbers("<u2", 7, 8), numbers("u1", 3, 8), numbers("u1", 0, 1),
