@@ -1,4 +1,4 @@
-"""The equations of deep Q-learning, eqs. (12) and (13), as pure functions of tensors.
+"""The equations of deep Q-learning, eqs. (8) and (9), as pure functions of tensors.
 
 B is the size of the minibatch; all values and rewards are in scaled reward, the unit that the network speaks.
 """
@@ -36,7 +36,7 @@ def of(q: Tensor, action: Tensor) -> Tensor:
 
 
 def td_error(q: Tensor, action: Tensor, y: Tensor) -> Tensor:
-    """Q(o_t, a_t; theta) - y_t, the error inside eq. (13). Shape (B,)."""
+    """Q(o_t, a_t; theta) - y_t, the error inside eq. (9). Shape (B,)."""
     return of(q, action) - y
 
 

@@ -16,7 +16,7 @@ from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.policy import check_view, features
 
 Shape = tuple[int, int, int]
-"""(channels, height, width) of an observation, eq. (10)."""
+"""(channels, height, width) of an observation, eq. (12)."""
 
 
 class QNet(nn.Module):

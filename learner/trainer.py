@@ -26,7 +26,7 @@ from tmc.wire.messages import Minibatch
 class UpdateMetrics:
     """What update number `updates` did. Means over the minibatch; values in scaled reward, as the network has them.
 
-    `loss`: eq. (13). `q_mean`: Q(o, a; theta). `target_mean`: y of eq. (12). `td_abs`: |Q - y|. `grad_norm`: Euclidean,
+    `loss`: eq. (9). `q_mean`: Q(o, a; theta). `target_mean`: y of eq. (8). `td_abs`: |Q - y|. `grad_norm`: Euclidean,
     over all weights.
     """
 
@@ -69,7 +69,7 @@ class Trainer:
             self.adam.state[p] = {"step": torch.zeros(()), **zeros}
 
     def update(self, minibatch: Minibatch) -> UpdateMetrics:
-        """One step of Adam on eq. (13), and theta- = theta when that is due. Raises TrainingError."""
+        """One step of Adam on eq. (9), and theta- = theta when that is due. Raises TrainingError."""
         check(minibatch, self.shape)
         self._follow(minibatch.episodes)
         o, o_next = images(minibatch.observation), images(minibatch.next_observation)
@@ -83,7 +83,7 @@ class Trainer:
 
     @torch.no_grad()
     def _target(self, minibatch: Minibatch, o_next: Tensor) -> Tensor:
-        """y of eq. (12), of scaled rewards."""
+        """y of eq. (8), of scaled rewards."""
         reward = torch.tensor(minibatch.reward) * self.config.dqn.reward_scale
         choice = self.online(o_next) if self.config.dqn.double else None
         discount, allowed = torch.tensor(minibatch.discount), torch.tensor(minibatch.allowed)

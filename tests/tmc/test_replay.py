@@ -60,7 +60,7 @@ def test_observations_of_flights_with_lost_processes(mission: Callable[..., Any]
 
 
 def test_the_observation_is_what_the_paper_says(mission: Callable[..., Any], town: RoadMap) -> None:
-    """P, M and U of eq. (10), rebuilt, against plain loops over the tracks; phases together, so all maps are simple."""
+    """P, M and U of eq. (12), rebuilt, against plain loops over the tracks; phases together, so all maps are simple."""
     T, T_u, N = 40, 10, 4
     values = {"team.size": N, "comms.period": T_u, "training.ticks": T}
     flown = mission(values, town).play(Random(5))

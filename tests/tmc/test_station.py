@@ -161,7 +161,7 @@ def test_strangers_are_refused(station_of: Callable[..., Station]) -> None:
     station = station_of()
     rejects(station, "uav-002", m.Hello("uav", 2, 1), "refused", "UAV 2")
     rejects(station, "uav-000", m.Hello("uav", -1, 1), "refused", "UAV -1")
-    rejects(station, LEARNER, m.Hello("learner", -1, 1), "refused", "no learner")
+    rejects(station, LEARNER, m.Hello("learner", -1, 1), "refused", "learner")
     rejects(station, "observer-1", m.PolicyRequest(1), "state", "no policy 1")
     for message in (m.Ack(1), m.End("x"), m.Welcome("", "", "", "", 0), m.Error("state", "x")):
         rejects(station, "observer-1", message, "state", "not a message for the TMC")

@@ -65,7 +65,7 @@ class Comms:
 class Reward:
     collision: float = _s(-20.0, "r^c of a blocked move, instead of any other reward", source="Sec. IV-B")
     new_cell: float = _s(1.0, "r^n of a cell not visited so far in the episode", source="Sec. IV-B")
-    weight: float = _s(5.0, "lambda, the weight of r^u in eq. (11)", source="Sec. IV-B")
+    weight: float = _s(5.0, "lambda, the weight of r^u in eq. (13)", source="Sec. IV-B")
     uncertainty: Literal["true", "own"] = _s(
         "true", "r^u of the true map, written by the TMC, or of the UAV's own", source="Sec. III-B: r^u = u_k(t)"
     )
@@ -89,7 +89,7 @@ class Exploration:
 
 @dataclass(frozen=True)
 class Observation:
-    view: Literal["whole", "ego"] = _s("whole", "the whole grid, or a square around the UAV", source="eq. (10): whole")
+    view: Literal["whole", "ego"] = _s("whole", "the whole grid, or a square around the UAV", source="eq. (12): whole")
     radius: int = _s(8, "half width of the egocentric view: 2 radius + 1 cells", "cells")
     near: int = _s(0, "also feed the (2 near + 1)^2 cells around the UAV to the dense layer; 0: off", "cells")
 
@@ -107,10 +107,10 @@ class DQN:
     learning_rate: float = _s(1e-3, "Adam's step size", source="Table I")
     batch: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I")
     gamma: float = _s(0.99, "discount factor", "1/tick", "Table I")
-    n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (12): 1")
-    double: bool = _s(False, "choose a' by the online network (double Q-learning)", source="eq. (12): no")
-    loss: Literal["mse", "huber"] = _s("mse", "loss of Q against its target", source="eq. (13)")
-    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (11): 1")
+    n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (8): 1")
+    double: bool = _s(False, "choose a' by the online network (double Q-learning)", source="eq. (8): no")
+    loss: Literal["mse", "huber"] = _s("mse", "loss of Q against its target", source="eq. (9)")
+    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (13): 1")
     target_episodes: int = _s(5, "f: copy theta to theta- every f episodes; 0: off", "episodes", "Table I")
     target_updates: int = _s(0, "copy theta to theta- every so many updates; 0: off", "updates")
 
@@ -297,7 +297,7 @@ def _convert(setting: Setting, value: Any) -> Any:
             return value
         if get_origin(kind) is tuple:
             items = value.split(",") if isinstance(value, str) else value
-            return tuple(int(v) for v in items)
+            return tuple(_as_int(v) for v in items)
         if kind is bool:
             return _as_bool(value)
         if kind is int:
@@ -307,10 +307,12 @@ def _convert(setting: Setting, value: Any) -> Any:
             if isinstance(value, bool) or not math.isfinite(number):
                 raise ValueError
             return number
-        return str(value)
+        if not isinstance(value, str):
+            raise ValueError
+        return value
     except ConfigError:
         raise
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         name = getattr(kind, "__name__", str(kind))
         raise ConfigError(
             f"{key} = {value!r} is not {'a list of int' if name == 'tuple' else f'of type {name}'}"

@@ -1,4 +1,4 @@
-"""The observation o_i(t) = [P_i(t), M, U_i(t)] (eq. 10), as a UAV builds it and as the replay rebuilds it, bit for bit.
+"""The observation o_i(t) = [P_i(t), M, U_i(t)] (eq. 12), as a UAV builds it and as the replay rebuilds it, bit for bit.
 
 Channels: P, ego 1.0 and sensed peers 0.5; M, road 1, free 0, blocked or off the grid -1; U, the UAV's own map. The
 view is the whole grid, or the square of `2 radius + 1` cells around the UAV.

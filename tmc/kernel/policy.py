@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, fields
 
 from tmc.kernel.config import Config, ConfigError, Network
 from tmc.kernel.grid import N_ACTIONS, Grid
@@ -14,6 +15,8 @@ KEY = "overfly"
 INPUT, OUTPUT = "observation", "q"
 """Names of the model's input, (batch, channels, height, width) float32, and output, (batch, 9) float32."""
 N_CHANNELS = 3
+MINIBATCH_LIMIT = 64 * 1024 * 1024
+"""Largest field of a minibatch, bytes: one frame on the wire."""
 
 
 class PolicyError(ValueError):
@@ -44,8 +47,10 @@ class PolicyCard:
     def from_json(text: str) -> PolicyCard:
         try:
             card = PolicyCard(**json.loads(text))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RecursionError):
             raise PolicyError("the file is not an Overfly policy: its description cannot be read") from None
+        if any(type(getattr(card, f.name)).__name__ != f.type for f in fields(PolicyCard)):
+            raise PolicyError("the file is not an Overfly policy: its description has values of the wrong type")
         if card.format != FORMAT:
             raise PolicyError(f"the policy has format {card.format}, this Overfly reads format {FORMAT}")
         return card
@@ -81,6 +86,9 @@ def check_view(config: Config, shape: tuple[int, int, int]) -> None:
             f"observation.near = {near} is larger than the view: choose {(min(shape[1:]) - 1) // 2} or less"
         )
     features(config.network, *shape[1:])
+    size, limit = 4 * math.prod(shape), MINIBATCH_LIMIT
+    if config.dqn.batch * size > limit:
+        raise ConfigError(f"dqn.batch = {config.dqn.batch} is too large to send: choose {limit // size} or less")
 
 
 def card_for(config: Config, grid: Grid, version: int, updates: int) -> PolicyCard:

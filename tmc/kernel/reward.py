@@ -1,4 +1,4 @@
-"""The reward, eq. (11): r = r^c + r^n + lambda r^u, and why a move can be blocked."""
+"""The reward, eq. (13): r = r^c + r^n + lambda r^u, and why a move can be blocked."""
 
 from __future__ import annotations
 

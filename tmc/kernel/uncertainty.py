@@ -83,15 +83,37 @@ def arrival_probability(alpha: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def lower_bound(alpha: NDArray[np.float64], uavs: int, ticks: int) -> float:
-    """No team of N UAVs can have a smaller eq. (6) in scenario II, all cells visited at t = 0.
+    """No team of N UAVs can have a smaller eq. (6) in scenario II, from a map all visited.
 
-    At each tick at most N cells have age 0, at most N have age 1, and so on; cells not reached yet have age t. The
-    bound pairs the largest ages with the smallest rates, is exact for uniform rates with perfect tours, and ignores
-    where the UAVs stand. Returns the sum over cells, averaged over ticks 1..T.
+    Returns the sum over cells, averaged over ticks 1..T. For uneven rates, the N T visits go where they save most.
+    Where UAVs stand, and that one visits one cell a tick, is ignored.
     """
-    rates = np.sort(alpha[alpha > 0])[::-1]
+    rates = alpha[alpha > 0]
+    relaxed = _best_spread(rates, uavs * ticks, ticks)
+    return max(relaxed, _youngest(rates, uavs, ticks)) if np.ptp(rates) == 0 else relaxed
+
+
+def _youngest(rates: NDArray[np.float64], uavs: int, ticks: int) -> float:
+    """Equal rates: at each tick at most N cells have age 0, at most N have age 1, and so on; the rest have age t."""
     ages = np.arange(rates.size) // max(uavs, 1)
-    total = 0.0
-    for t in range(1, ticks + 1):
-        total += float(-np.expm1(-rates * np.minimum(ages, t)).sum())
-    return total / ticks
+    sums = (-np.expm1(-rates * np.minimum(ages, t)).sum() for t in range(1, ticks + 1))
+    return float(sum(sums)) / ticks
+
+
+def _best_spread(rates: NDArray[np.float64], visits: int, ticks: int) -> float:
+    """Any rates: `visits` visits in all, each cell's evenly spaced, spent where they save most.
+
+    A cell with n visits has n + 1 stretches of T - n unvisited ticks together. What it costs is convex in n, so taking
+    the largest savings first is the optimum of this relaxed problem.
+    """
+    n = np.arange(ticks + 1)
+    length, longer = np.divmod(ticks - n, n + 1)
+    distinct_rates, cells = np.unique(rates, return_counts=True)
+    u = -np.expm1(-distinct_rates[:, None] * np.arange(ticks + 1))
+    stretch = np.cumsum(u, axis=1)  # the sum of u over ages 1..l, since u at age 0 is 0
+    cost = (n + 1 - longer) * stretch[:, length] + longer * stretch[:, np.minimum(length + 1, ticks)]
+    saved = -np.diff(cost, axis=1).ravel()
+    order = np.argsort(-saved, kind="stable")
+    counts = np.repeat(cells, ticks)[order]
+    spent = np.clip(visits - (np.cumsum(counts) - counts), 0, counts)
+    return float(cells @ cost[:, 0] - saved[order] @ spent) / ticks

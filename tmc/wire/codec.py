@@ -15,7 +15,7 @@ import numpy as np
 from tmc.wire import fields
 from tmc.wire.messages import MESSAGES, PROTOCOL, Message
 
-HEADER_LIMIT = 4 * 1024 * 1024
+HEADER_LIMIT = 5 * 1024 * 1024
 """Largest first frame, bytes: a flight record of the longest episode fits."""
 _TYPES = {cls.__name__: cls for cls in MESSAGES}
 _FRAMED = ("tensor", "bytes")
@@ -56,6 +56,8 @@ def decode(frames: Sequence[Any]) -> Message:
     for name, rule in fields.rules(cls).items():
         present = name in header
         raw = header.pop(name, None)
+        if rule.kind == "bytes" and present:
+            raise CodecError("malformed", f"{cls.__name__}.{name} belongs into a frame of its own")
         if rule.kind in _FRAMED:
             raw = _frame(rest, name, raw, rule)
         elif rule.kind == "array":
@@ -76,13 +78,28 @@ def _header(frames: Sequence[Any]) -> dict[str, Any]:
         raise CodecError("malformed", f"the first frame must have 1 to {HEADER_LIMIT} bytes")
     try:
         header = msgpack.unpackb(
-            frames[0], strict_map_key=True, max_map_len=64, max_array_len=64, max_ext_len=0, use_list=True
-        )
+            frames[0], strict_map_key=True, max_map_len=64, max_array_len=8, max_ext_len=0,
+            object_pairs_hook=_flat_map, list_hook=_flat_list,
+        )  # fmt: skip
     except Exception:  # msgpack raises a dozen kinds, some of them bare ValueError or RecursionError
         raise CodecError("malformed", "the first frame is no msgpack map within the limits") from None
     if not isinstance(header, dict) or not all(isinstance(k, str) for k in header):
         raise CodecError("malformed", "the first frame is no msgpack map with string keys")
     return header
+
+
+def _flat_map(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+    """The header; refuses a map inside it, since a megabyte of nested empty maps unpacks to a hundred."""
+    if any(isinstance(value, dict) for _, value in pairs):
+        raise ValueError("a map inside the header")
+    return dict(pairs)
+
+
+def _flat_list(items: list[Any]) -> list[Any]:
+    """A shape; refuses anything but ints in it, for the same reason."""
+    if any(type(item) is not int for item in items):
+        raise ValueError("a list of something else than ints")
+    return items
 
 
 def _message_class(header: dict[str, Any]) -> type[Message]:
@@ -110,9 +127,12 @@ def _frame(rest: Any, name: str, shape: Any, rule: fields.Rule) -> Any:
     count = 1
     for n in shape:
         count *= n
-    if count * dtype.itemsize != len(memoryview(data).cast("B")):
+    if count * dtype.itemsize != memoryview(data).nbytes:
         raise CodecError("malformed", f"the frame of {name} does not have the size of its shape")
-    return np.frombuffer(data, dtype).reshape(shape)
+    try:
+        return np.frombuffer(data, dtype).reshape(shape)
+    except ValueError:  # a side of 0 among sides whose product NumPy cannot hold
+        raise CodecError("malformed", f"the shape of {name} is impossible") from None
 
 
 def _array(raw: Any, name: str, rule: fields.Rule) -> Any:

@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+FRAME_LIMIT = 64 * 1024 * 1024
+"""Largest frame, bytes: what a socket takes (tmc.wire.sockets)."""
+
 
 class FieldError(ValueError):
     """A field breaks its rule; `code` is the code of the error reply."""
@@ -68,7 +71,7 @@ def array(dtype: str, longest: int) -> Any:
 
 def tensor(dtype: str, ndim: int) -> Any:
     """A large array in a frame of its own, so that neither side copies it."""
-    return _field(Rule("tensor", 0, 2**28, dtype=dtype, ndim=ndim))
+    return _field(Rule("tensor", 0, FRAME_LIMIT // np.dtype(dtype).itemsize, dtype=dtype, ndim=ndim))
 
 
 def rules(cls: type) -> dict[str, Rule]:
@@ -108,6 +111,10 @@ def _float(value: Any, rule: Rule) -> str:
 def _str(value: Any, rule: Rule) -> str:
     if type(value) is not str or len(value) > rule.high:
         return f"must be a string of at most {int(rule.high)} characters"
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return "must be text that UTF-8 can carry"
     return "" if not rule.choices or value in rule.choices else f"must be one of {', '.join(rule.choices)}"
 
 

@@ -16,9 +16,10 @@ from typing import Any
 import zmq
 
 from tmc.wire.codec import CodecError, decode, encode
+from tmc.wire.fields import FRAME_LIMIT
 from tmc.wire.messages import Message
 
-PART_LIMIT = 64 * 1024 * 1024
+PART_LIMIT = FRAME_LIMIT
 """Largest frame that a socket takes, bytes; the codec has tighter limits for the header."""
 PARTS = 16
 """Most frames in a message."""
@@ -34,7 +35,7 @@ def feed_endpoint(sync: str) -> str:
     """The learner's endpoint, beside that of the UAVs: the next tcp port, or the same ipc path with `.feed`."""
     if sync.startswith("tcp://"):
         host, _, port = sync.rpartition(":")
-        if port.isdigit() and 0 < int(port) < 65_535:
+        if re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) < 65_535:
             return f"{host}:{int(port) + 1}"
     if sync.startswith("ipc://") and len(sync) > len("ipc://"):
         return f"{sync}.feed"
@@ -56,6 +57,7 @@ def free_port() -> int:
 
 def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Socket[Any]:
     """A bound ROUTER. A client that comes back takes over its name; a message to nobody raises."""
+    _check_endpoint(endpoint)
     sock: zmq.Socket[Any] = context.socket(zmq.ROUTER)
     sock.setsockopt(zmq.LINGER, 0)
     sock.setsockopt(zmq.RCVHWM, queue)
@@ -64,23 +66,30 @@ def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Soc
     sock.setsockopt(zmq.ROUTER_HANDOVER, 1)
     sock.setsockopt(zmq.ROUTER_MANDATORY, 1)
     try:
-        if endpoint.startswith("ipc://") and _alive(endpoint):
-            raise EndpointError(f"{endpoint} is in use by another process: choose another path")
         sock.bind(endpoint)
     except zmq.ZMQError as error:
         sock.close()
         raise EndpointError(f"cannot bind {endpoint}: {error.strerror or error}; choose a free port or path") from None
-    except EndpointError:
-        sock.close()
-        raise
     return sock
+
+
+def _check_endpoint(endpoint: str) -> None:
+    """Refuse what ZeroMQ would do something surprising with: wrap a port round, or take a path from its owner."""
+    if endpoint.startswith("tcp://"):
+        port = endpoint.rpartition(":")[2]
+        if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65_535:
+            raise EndpointError(f"{endpoint} has no port from 1 to 65535: write tcp://HOST:PORT")
+    path = Path(endpoint.removeprefix("ipc://"))
+    if endpoint.startswith("ipc://") and path.exists():
+        if path.is_file():
+            raise EndpointError(f"{path} is a file that is no socket: choose another path")
+        if path.is_socket() and _alive(endpoint):
+            raise EndpointError(f"{endpoint} is in use by another process: choose another path")
 
 
 def _alive(endpoint: str) -> bool:
     """True when somebody listens on an ipc path: ZeroMQ would take the path away from it without a word."""
     path = endpoint.removeprefix("ipc://")
-    if not Path(path).is_socket():
-        return False
     with socket.socket(socket.AF_UNIX) as probe:
         return probe.connect_ex(path) == 0
 

@@ -1,4 +1,4 @@
-"""The observation, eq. (10): its values, and that a UAV and the replay build the same bits and allow the same moves."""
+"""The observation, eq. (12): its values, and that a UAV and the replay build the same bits and allow the same moves."""
 
 from __future__ import annotations
 

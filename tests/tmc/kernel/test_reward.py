@@ -1,4 +1,4 @@
-"""The reward, eq. (11): its parts, what a blocked UAV gets, and the credit aligned with the team's objective."""
+"""The reward, eq. (13): its parts, what a blocked UAV gets, and the credit aligned with the team's objective."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def toronto() -> World:
     return World(build({}))
 
 
-def test_eq_08_in_scenario_1_the_observation_is_the_state(fly: Fly) -> None:
+def test_eq_10_in_scenario_1_the_observation_is_the_state(fly: Fly) -> None:
     """[p_i, M, p_-i, U]: all of it can be read from the three channels, so the process is fully observable."""
     flown = fly({"scenario": 1, "world.alpha": 0.1})
     world, observer = flown.world, Observer(flown.world)
@@ -34,7 +34,7 @@ def test_eq_08_in_scenario_1_the_observation_is_the_state(fly: Fly) -> None:
         assert u.sum() == flown.series("uncertainty", episode)[t]
 
 
-def test_eqs_09_and_10_observation_has_three_channels_of_m_by_m(toronto: World) -> None:
+def test_eqs_11_and_12_observation_has_three_channels_of_m_by_m(toronto: World) -> None:
     """o_i = [P_i, M, U_i]; different values for the ego UAV and N_i, and for obstacles, free cells and roads."""
     observer = Observer(toronto)
     u = np.linspace(0, 1, toronto.law.cells.size)
@@ -63,7 +63,7 @@ def test_sec_3b_actions_lead_to_the_neighbouring_cells(toronto: World) -> None:
 
 @pytest.mark.parametrize("pilot", ["planner:random", "planner:greedy"])
 @pytest.mark.parametrize("scenario", [1, 2])
-def test_eq_11_reward_of_every_step(pilot: str, scenario: int, fly: Fly) -> None:
+def test_eq_13_reward_of_every_step(pilot: str, scenario: int, fly: Fly) -> None:
     """r = r^c + r^n + lambda r^u: -20 when blocked and nothing else; +1 for a cell not visited so far; 5 u_k before
     the visit, by the true map. Recomputed from cells and blocks; the journal holds the team's mean."""
     flown = fly({"team.pilot": pilot, "scenario": scenario, "world.alpha": 0.05, "team.size": 6})
@@ -88,7 +88,7 @@ def test_eq_11_reward_of_every_step(pilot: str, scenario: int, fly: Fly) -> None
             assert journal[t] == pytest.approx(np.mean(rewards), abs=1e-4)
 
 
-def test_eq_11_visiting_uncertain_cells_pays_what_it_takes_from_eq_06(fly: Fly) -> None:
+def test_eq_13_visiting_uncertain_cells_pays_what_it_takes_from_eq_06(fly: Fly) -> None:
     """The accounting identity, end to end: with every true u before a visit, eq. (6) of the flight follows."""
     flown = fly({"comms.period": 10})
     world, q, T = flown.world, np.exp(-0.01), 37
