@@ -89,7 +89,7 @@ class Pilot:
         self.visited = set(track)
         self.shipped = begin.shipped
         self.leg = Leg(begin.shipped + 1)
-        self.pending = None
+        self.pending, self._answered = None, False
         if begin.shipped < 0:
             self.leg.cells.append(self.cell)
         for tick, cell in enumerate(track):  # a process that was started again says again where it was
@@ -98,15 +98,16 @@ class Pilot:
 
     def on_map(self, answer: Map) -> PolicyRequest | None:
         """The TMC's answer to the record of tick t; anything else is old news and dropped."""
-        if self.phase is not Phase.MAP or (answer.episode, answer.tick) != (self.episode, self.t):
+        if (answer.episode, answer.tick) != (self.episode, self.t) or self.t > self.shipped or self._answered:
             return None
         if self.config.scenario == 1:
             self.active[:] = False
             self.active[answer.active] = True
         else:
             self.last_visit = merge(self.last_visit, answer.last_visit)
-        self.version, self.pending = answer.version, None
-        return self._want(answer.policy, Phase.ACT)
+        self.version, self.pending, self._answered = answer.version, None, True
+        # A flight taken up again is answered before it has sensed its peers anew.
+        return self._want(answer.policy, Phase.ACT if self.phase is Phase.MAP else Phase.SENSE)
 
     def _want(self, version: int, then: Phase) -> PolicyRequest | None:
         """A policy reaches a UAV only at an exchange: ask for the one that the TMC names, if it is another."""
@@ -150,7 +151,7 @@ class Pilot:
         due, fresh = self.config.due(self.uav, self.t), self.t > self.shipped
         if fresh:  # a flight taken up again stands at a tick that the TMC has
             self.leg.seen.extend((self.t, cell) for cell in self.peers)
-        self.phase = Phase.MAP if due else Phase.ACT
+        self.phase = Phase.MAP if due and not self._answered else Phase.ACT
         return due and fresh
 
     def _ship(self) -> Record:
@@ -203,7 +204,7 @@ class Pilot:
         u = self._before_visit(k, cell) if k >= 0 else 0.0
         self.leg.rewards.append(self.reward(bool(block), cell not in self.visited, k, u))
         self.visited.add(cell)
-        self.t, self.cell, self.previous = self.t + 1, cell, self.cell
+        self.t, self.cell, self.previous, self._answered = self.t + 1, cell, self.cell, False
         self.airspace.tracks.publish(self.t, cell)
         self.leg.cells.append(cell)
         self.leg.actions.append(self.action)

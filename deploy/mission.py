@@ -77,7 +77,8 @@ class Mission:
         (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
         self.progress = Progress(config, self.world.law.cells.size, bound_of(self.world))
         self._start = time.time()
-        self._write_run({})
+        self._ended: dict[str, Any] = {}
+        self._write_run(self._ended)
 
     def run(self, *, in_one_process: bool) -> int:
         """Fly it; returns the exit code. What it left is in the run folder either way."""
@@ -95,6 +96,7 @@ class Mission:
             return process.STOPPED if stopped.args else 130
         finally:
             self.progress.clear()
+            self._write_run(self._ended)
         return process.DONE
 
     def _fly(self) -> None:
@@ -114,7 +116,7 @@ class Mission:
             observer.close()
             supervisor.stop()
             supervisor.close()
-            self._write_run({"exit_codes": supervisor.exit_codes(), "restarts": supervisor.restarts()})
+            self._ended = {"exit_codes": supervisor.exit_codes(), "restarts": supervisor.restarts()}
 
     def _write_run(self, more: dict[str, Any]) -> None:
         """`run.json`: what was run, with which versions, and how each process ended."""

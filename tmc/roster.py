@@ -40,3 +40,19 @@ class Member:
     sequence: int = 0
     answer: m.Map | None = None
     named: bool = False
+
+
+def name_some(names: list[str]) -> str:
+    """The first ten names, and how many more there are."""
+    return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+
+
+def silent(members: list[Member], waited_for: list[str], now: float, patience: float) -> list[str]:
+    """Those of the UAVs waited for who were not heard of for `patience` seconds, each named once in its silence."""
+    found = []
+    for name in waited_for:
+        member = members[int(name.removeprefix("uav-"))]
+        if not member.named and member.heard and now - member.heard > patience:
+            member.named = True
+            found.append(name)
+    return found

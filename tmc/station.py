@@ -17,8 +17,9 @@ from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.world import World
 from tmc.limiter import Limiter
+from tmc.policies import Policies
 from tmc.replay import Replay
-from tmc.roster import LEARNER, Member, Outbox, uav_name
+from tmc.roster import LEARNER, Member, Outbox, name_some, silent, uav_name
 from tmc.wire import messages as m
 
 
@@ -41,8 +42,7 @@ class Station:
         self.version = self.ticks = self.episodes = self.rejected = 0
         self.blocked = self.blocked_by_uav = 0
         self.uncertainty = self.episode_uncertainty = self.loss = 0.0
-        self.policy_version = 0
-        self.policies: dict[int, bytes] = {}
+        self.policies = Policies()
         self.learner_life = -1
         self.out = Outbox()
         self._held: list[tuple[str, m.Message]] = []
@@ -65,12 +65,10 @@ class Station:
     def status(self) -> m.Status:
         """Progress, for whoever asks."""
         flight = self.flight
-        names = self.waiting_for()
-        waiting = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
         return m.Status(
             self.phase, flight.episode if flight else self.episodes, max(flight.done, 0) if flight else 0, self.ticks,
-            self.limiter.updates, self.policy_version, self.loss, self.uncertainty, self.episode_uncertainty,
-            self.blocked, self.rejected, waiting,
+            self.limiter.updates, self.policies.newest, self.loss, self.uncertainty, self.episode_uncertainty,
+            self.blocked, self.rejected, name_some(self.waiting_for()),
         )  # fmt: skip
 
     def waiting_for(self) -> list[str]:
@@ -79,7 +77,7 @@ class Station:
             if self.phase != "gathering":
                 return []
             missing = [uav_name(i) for i, member in enumerate(self.roster) if member.life < 0]
-            return missing + ([LEARNER] if self.learning and not self.policy_version else [])
+            return missing + ([LEARNER] if self.learning and not self.policies.newest else [])
         flight, t = self.flight, self.flight.next_exchange
         return [uav_name(i) for i in range(flight.N) if self.config.due(i, t) and flight.reported[i] < t]
 
@@ -90,8 +88,10 @@ class Station:
         handler = _HANDLERS.get(type(message))
         if handler is None:
             self.reject(sender, "state", f"{type(message).__name__} is not a message for the TMC")
-            return
-        handler(self, sender, message, now)
+        elif isinstance(message, m.SampleRequest | m.PolicyPush) and (sender != LEARNER or not self.learning):
+            self.reject(sender, "refused", f"only the learner may send a {type(message).__name__}")
+        else:
+            handler(self, sender, message, now)
 
     def reject(self, sender: str, code: str, text: str) -> None:
         """Count and note a frame that changes nothing, and tell its sender what was wrong."""
@@ -101,7 +101,7 @@ class Station:
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))
-        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks, self.policy_version)
+        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks, self.policies.newest)
         if hello.role == "learner":
             if not self.learning or sender != LEARNER:
                 self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
@@ -178,10 +178,10 @@ class Station:
 
     def _answer(self, flight: Flight, exchange: Exchange) -> None:
         self.version = exchange.version
-        self.out.entries += entries.exchange(flight, exchange, self.policy_version)
+        self.out.entries += entries.exchange(flight, exchange, self.policies.newest)
         for i in exchange.uavs:
             answer = m.Map(
-                flight.episode, exchange.tick, exchange.version, self.policy_version, self.roster[i].sequence - 1,
+                flight.episode, exchange.tick, exchange.version, self.policies.newest, self.roster[i].sequence - 1,
                 exchange.last_visit, exchange.active,
             )  # fmt: skip
             self._held.append((uav_name(i), answer))
@@ -194,14 +194,12 @@ class Station:
         self.limiter.insert(moves, len(self.replay))
         self.uncertainty = truth.uncertainty[-1]
         steps, updates = self.ticks * flight.N, self.limiter.updates
-        self.out.entries += entries.truth(flight, truth, steps, updates, self.policy_version)
+        self.out.entries += entries.truth(flight, truth, steps, updates, self.policies.newest)
 
     # Episodes.
 
     def _try_begin(self) -> None:
-        ready = all(member.life >= 0 for member in self.roster)
-        policy = self.policy_version > 0 or self.config.team.pilot != "policy"
-        if self.phase == "gathering" and ready and policy:
+        if self.phase == "gathering" and not self.waiting_for():
             self._begin_episode()
 
     def _begin_episode(self) -> None:
@@ -218,7 +216,7 @@ class Station:
         shipped = flight.reported[i]
         tick = max(shipped, 0)
         return m.Begin(
-            flight.episode, tick, shipped, self.roster[i].sequence, flight.version, self.policy_version,
+            flight.episode, tick, shipped, self.roster[i].sequence, flight.version, self.policies.newest,
             flight.beliefs[i].copy(), flight.cells[: tick + 1, i].copy(),
         )  # fmt: skip
 
@@ -274,9 +272,6 @@ class Station:
     # The learner.
 
     def _sample_request(self, sender: str, request: m.SampleRequest, _now: float) -> None:
-        if sender != LEARNER or not self.learning:
-            self.reject(sender, "refused", "only the learner may ask for a minibatch")
-            return
         if len(self._requests) >= 8:
             self.reject(sender, "refused", "more than 8 minibatch requests in flight")
             return
@@ -296,31 +291,26 @@ class Station:
         self._finish_if_done()
 
     def _policy_push(self, sender: str, push: m.PolicyPush, _now: float) -> None:
-        if sender != LEARNER or not self.learning:
-            self.reject(sender, "refused", "only the learner may push a policy")
-            return
-        if push.version <= self.policy_version:
-            self.reject(sender, "refused", f"policy {push.version} is not newer than {self.policy_version}")
+        if push.version <= self.policies.newest:
+            self.reject(sender, "refused", f"policy {push.version} is not newer than {self.policies.newest}")
             return
         self._take_policy(push.version, push.model, push.updates, push.loss)
         self._send(sender, m.Ack(push.version))
         self._try_begin()
 
     def _take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
-        self.policy_version, self.loss = version, loss
-        self.policies[version] = model
-        needed = {version} | {a.policy for a in (member.answer for member in self.roster) if a is not None}
-        needed |= {a.policy for _, a in self._held if isinstance(a, m.Map | m.Begin)}
-        self.policies = {v: p for v, p in self.policies.items() if v in needed}
+        answers = (member.answer for member in self.roster)
+        named = [a.policy for a in (*answers, *(x for _, x in self._held)) if isinstance(a, m.Map | m.Begin)]
+        self.policies.take(version, model, named)
+        self.loss = loss
         self.out.entries.append(entries.policy(version, updates, loss, model, last=self._ended))
 
     def _policy_request(self, sender: str, request: m.PolicyRequest, _now: float) -> None:
-        # Superseded since it was named: the newest is the one to fly, and the record will say so.
-        version = request.version if request.version in self.policies else self.policy_version
-        if version not in self.policies:
+        found = self.policies.find(request.version)
+        if found is None:
             self.reject(sender, "state", f"there is no policy {request.version}")
-            return
-        self._send(sender, m.Policy(version, self.policies[version]))
+        else:
+            self._send(sender, m.Policy(*found))
 
     # The rest.
 
@@ -341,14 +331,10 @@ class Station:
 
     def tick(self, now: float) -> None:
         """Name, once each, the UAVs that the others wait for and that have been silent for too long."""
-        patience = self.config.comms.patience
-        if self.flight is None:
-            return
-        for name in self.waiting_for():
-            member = self.roster[int(name[4:])]
-            if not member.named and member.heard and now - member.heard > patience:
-                member.named = True
-                text = f"{name} has been silent for {patience:g} s at tick {self.flight.next_exchange}; others wait"
+        if self.flight is not None:
+            patience, tick = self.config.comms.patience, self.flight.next_exchange
+            for name in silent(self.roster, self.waiting_for(), now, patience):
+                text = f"{name} has been silent for {patience:g} s at tick {tick}; others wait"
                 self.out.notes.append(("WARNING", text))
 
 

@@ -230,12 +230,8 @@ class Setting:
     source: str
 
 
-def settings() -> Iterator[Setting]:
-    """Every setting, in the order of the classes above."""
-    yield from _settings(Config, "")
-
-
 def _settings(cls: type, prefix: str) -> Iterator[Setting]:
+    """Every setting, in the order of the classes above."""
     hints = get_type_hints(cls)
     for f in dataclasses.fields(cls):
         kind = hints[f.name]
@@ -245,7 +241,7 @@ def _settings(cls: type, prefix: str) -> Iterator[Setting]:
             yield Setting(prefix + f.name, kind, f.default, **f.metadata)
 
 
-SETTINGS: Mapping[str, Setting] = types.MappingProxyType({s.key: s for s in settings()})
+SETTINGS: Mapping[str, Setting] = types.MappingProxyType({s.key: s for s in _settings(Config, "")})
 
 
 def get(config: Config, key: str) -> Any:

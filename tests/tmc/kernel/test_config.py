@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import settings as quick
 from hypothesis import strategies as st
 
-from tmc.kernel.config import RANGES, SETTINGS, Config, ConfigError, build, check, flat, get, settings
+from tmc.kernel.config import RANGES, SETTINGS, Config, ConfigError, build, check, flat, get
 
 QUICK = quick(max_examples=50, deadline=None)
 
@@ -83,7 +83,7 @@ def test_defaults_are_among_their_choices(key: str) -> None:
 
 
 def test_settings_come_in_order_and_once() -> None:
-    keys = [s.key for s in settings()]
+    keys = [setting.key for setting in SETTINGS.values()]
     assert keys[0] == "scenario"
     assert keys == list(SETTINGS)
     assert list(flat(Config())) == keys

@@ -1,0 +1,27 @@
+"""The policies that the TMC holds: the newest, and older ones only while a UAV may still ask for them by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class Policies:
+    """Policy files by version; `newest` is 0 while there is none."""
+
+    def __init__(self) -> None:
+        self.newest = 0
+        self._models: dict[int, bytes] = {}
+
+    def __len__(self) -> int:
+        return len(self._models)
+
+    def take(self, version: int, model: bytes, named: Iterable[int]) -> None:
+        """Hold a newer policy; of the others only those that were `named` to somebody."""
+        self.newest = version
+        wanted = {version, *named}
+        self._models = {v: p for v, p in (self._models | {version: model}).items() if v in wanted}
+
+    def find(self, version: int) -> tuple[int, bytes] | None:
+        """The policy with this version; the newest in its place when it was superseded since it was named."""
+        found = version if version in self._models else self.newest
+        return (found, self._models[found]) if found in self._models else None
