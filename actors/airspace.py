@@ -45,11 +45,17 @@ class Airspace:
         self._peers = [j for j in range(team) if j != uav]
         self._reach = max(grid.size if math.isinf(sensing) else math.floor(sensing), 1)
         self._quiet = [0] * team
+        self._lost: set[int] = set()
 
     def begin(self, episode: int, starts: list[int]) -> None:
         """A new episode."""
         self.tracks.begin(episode, starts)
         self._quiet = [0] * len(self._quiet)
+        self._lost.clear()
+
+    def lose(self, uav: int) -> None:
+        """Never wait for this UAV again: where it is not known, it is not."""
+        self._lost.add(uav)
 
     def sense(self, t: int, cell: int) -> list[int]:
         """Cells of the peers in N_i(t), in order of their ids; raises Waiting when one may be near and is unknown."""
@@ -75,7 +81,7 @@ class Airspace:
         """j's cell at t, or -1 when it is not known but surely farther than `reach` from `centre`."""
         s, newest = self.tracks.newest(j)
         where = self.tracks.at(j, t) if s >= t else -1
-        if where < 0 and self.grid.chebyshev(centre, newest) - abs(t - s) <= reach:
+        if where < 0 and j not in self._lost and self.grid.chebyshev(centre, newest) - abs(t - s) <= reach:
             raise Waiting(j, t)
         return where
 

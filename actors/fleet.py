@@ -6,7 +6,7 @@ from typing import Protocol
 
 from actors.airspace import Waiting
 from actors.pilot import Phase, Pilot
-from tmc.wire.messages import Begin, Map, Message, Policy
+from tmc.wire.messages import Begin, Lost, Map, Message, Policy
 
 
 class Exchange(Protocol):
@@ -30,6 +30,8 @@ class Fleet:
             answer = pilot.on_map(message)
         elif isinstance(message, Policy):
             pilot.on_policy(message)
+        elif isinstance(message, Lost):
+            pilot.on_lost(message)
         if answer is not None:
             self._say(uav, answer)
 

@@ -21,7 +21,10 @@ from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge
 from tmc.kernel.world import World
-from tmc.wire.messages import EMPTY, Begin, Map, Policy, PolicyRequest, Record
+from tmc.wire.messages import EMPTY, Begin, Lost, Map, Policy, PolicyRequest, Record
+
+STINT = 32
+"""Ticks that a pilot flies at most before it looks up."""
 
 
 class Phase(Enum):
@@ -81,6 +84,8 @@ class Pilot:
         self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, track[-1], track[-2:][0]
         self.sequence, self.version = begin.sequence, begin.version
         self.airspace.begin(self.episode, self.world.starts(self.episode))
+        for uav in begin.lost.tolist():
+            self.airspace.lose(uav)
         self._epsilon = self.config.epsilon(self.episode)
         self._draws = self.world.explorations(self.episode, self.uav)
         self._factor = self.world.initial_factor(self.episode)
@@ -117,6 +122,11 @@ class Pilot:
         self.phase, self._then, self.wanted = Phase.POLICY, then, version
         return PolicyRequest(version)
 
+    def on_lost(self, lost: Lost) -> None:
+        """The team goes on without a UAV."""
+        if lost.episode == self.episode:
+            self.airspace.lose(lost.uav)
+
     def on_policy(self, policy: Policy) -> None:
         """The policy that was asked for. Raises PolicyError when it cannot fly here."""
         if self.phase is Phase.POLICY and policy.version >= self.wanted:
@@ -126,8 +136,12 @@ class Pilot:
     # Flying.
 
     def advance(self) -> Record | None:
-        """Fly until a record must go out (returned), or a message is needed (None); raises Waiting for a peer."""
-        while True:
+        """Fly until a record must go out (returned), or a message is needed (None); raises Waiting for a peer.
+
+        Also returns after some ticks without either, so that whoever calls can listen and be heard (`under_way`).
+        """
+        until = self.t + STINT
+        while self.t < until:
             if self.phase is Phase.SENSE:
                 if self._sense():
                     return self._ship()
@@ -137,6 +151,12 @@ class Pilot:
                 self._move()
             else:
                 return None
+        return None
+
+    @property
+    def under_way(self) -> bool:
+        """True while nothing is needed to go on but another call of `advance`."""
+        return self.phase in (Phase.SENSE, Phase.ACT, Phase.MOVE)
 
     def _sense(self) -> bool:
         """Sense at t and make the local update (Sec. II-D): own cell and cells of sensed peers get tau = t.

@@ -15,7 +15,9 @@ from actors.airspace import Tracks, Waiting
 from actors.pilot import Phase, Pilot
 from actors.planners import PREFIX, Decider, PlannerDecider
 from actors.radio import RadioTracks
+from actors.stalls import Lead, StallingTracks, stalls
 from actors.tracks import TableTracks, open_table
+from actors.witness import Witness
 from tmc.kernel.config import build
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
@@ -52,7 +54,9 @@ class Service:
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, endpoint, f"uav-{uav:03d}")
         self.log: LogWriter | None = None
-        self.waited = 0.0
+        self.waited, self._peer = 0.0, -1
+        self.lead: Lead | None = None
+        self.witness: Witness | None = None
         self._said = time.monotonic()
         self._reported, self._status_due = (self._said, 0), 0.0
 
@@ -64,14 +68,16 @@ class Service:
             try:
                 record = pilot.advance()
             except Waiting as waiting:
+                self._stopped("distance")
                 self._wait_for_peer(waiting, naps)
                 naps += 1
                 continue
-            naps = 0
+            naps, self._peer = 0, -1
+            self._stopped("end" if pilot.t == pilot.config.training.ticks else "exchange")
             if record is not None:
                 self.say(record)
                 self._report(record)
-            self._listen(0.1)
+            self._listen(0 if pilot.under_way else 0.1)
         raise Left(process.STOPPED, "stopped by a signal")
 
     def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
@@ -102,14 +108,20 @@ class Service:
             tracks = TableTracks(open_table(Path(welcome.tracks), team, config.training.ticks), self.uav)
         else:
             tracks = radio = RadioTracks(self.uav, team, world.grid, observer.sensing, self._beacon)
+        if stalls(config, self.uav):
+            tracks = StallingTracks(tracks, config, self.uav)
+        self.lead = Lead() if config.trial.stall else None
+        self.witness = witness = Witness(observer) if config.trial.witness else None
 
         def decider(model: bytes) -> Decider:
             from actors.policy import NetworkDecider  # noqa: PLC0415  planners start without ONNX Runtime
 
-            return NetworkDecider(model, config, observer)
+            network = NetworkDecider(model, config, observer)
+            return witness.watch(network) if witness else network
 
         who = config.team.pilot
-        planner = PlannerDecider(world, who) if who.startswith(PREFIX) else None
+        planner: Decider | None = PlannerDecider(world, who) if who.startswith(PREFIX) else None
+        planner = witness.watch(planner) if witness and planner else planner
         return Pilot(world, self.uav, self.life, tracks, observer, decider, planner), radio
 
     # The radio.
@@ -147,6 +159,8 @@ class Service:
             self.say(pilot.pending)
         elif pilot.phase is Phase.POLICY:
             self.say(m.PolicyRequest(pilot.wanted))
+        elif pilot.under_way:
+            self.say(m.Alive(self.uav, self.life, pilot.t, self._peer))
         else:
             self.say(m.Hello("uav", self.uav, self.life))
 
@@ -158,6 +172,8 @@ class Service:
             return self.pilot.on_map(message)
         if isinstance(message, m.Policy):
             self.pilot.on_policy(message)
+        elif isinstance(message, m.Lost):
+            self.pilot.on_lost(message)
         elif isinstance(message, m.Beacon) and self.radio is not None:
             self.radio.hear(message)
         elif isinstance(message, m.End):
@@ -177,7 +193,7 @@ class Service:
 
     def _wait_for_peer(self, waiting: Waiting, tries: int) -> None:
         """Wait for the cell of a peer. The table is looked at again soon; beacons wake the socket."""
-        start = time.monotonic()
+        start, self._peer = time.monotonic(), waiting.peer
         if self.radio is not None:
             if not self.sock.poll(200):
                 self.radio.ask(waiting.peer)
@@ -188,6 +204,12 @@ class Service:
                 self._listen(0)
         self.waited += time.monotonic() - start
 
+    def _stopped(self, bound: str) -> None:
+        """In a trial: the UAV can fly no further for now, unless it is under way or has nothing to fly."""
+        pilot = self.pilot
+        if self.lead is not None and pilot.phase is not Phase.IDLE and (bound == "distance" or not pilot.under_way):
+            self.lead.note(pilot.airspace.lead(pilot.t), pilot.t, bound)
+
     # The log.
 
     def _note(self, level: str, text: str) -> None:
@@ -196,19 +218,26 @@ class Service:
 
     def _report(self, record: m.Record) -> None:
         """Where the UAV is, how fast it flies and how long it waited: for whoever looks at the log."""
-        now = time.monotonic()
-        if now < self._status_due or self.log is None:
+        if self.log is not None and self.witness is not None:
+            self.log.write(uav_topic(self.uav, "witness"), self.witness.testify(record))
+        pilot, (then, steps), now = self.pilot, self._reported, time.monotonic()
+        due = now >= self._status_due or (self.lead is not None and record.tick == pilot.config.training.ticks)
+        if self.log is None or not due:
             return
-        pilot, (then, steps) = self.pilot, self._reported
         rate = (pilot.steps - steps) / (now - then)
         self._reported, self._status_due = (now, pilot.steps), now + STATUS_EVERY
         self.log.write(uav_topic(self.uav, "status"), UavStatus(
             uav=self.uav, episode=record.episode, tick=record.tick, cell=pilot.cell, waited=self.waited,
-            steps_per_second=rate, explored=pilot.explored, lead=pilot.airspace.lead(pilot.t),
+            steps_per_second=rate, explored=pilot.explored, lead=pilot.airspace.lead(pilot.t), **self._lead_so_far(),
         ))  # fmt: skip
         where = pilot.world.map.lonlat(pilot.cell)
         if where is not None:
             self.log.write(uav_topic(self.uav, "fix"), location_fix(*where, self.log.now()))
+
+    def _lead_so_far(self) -> dict[str, Any]:
+        if self.lead is None:
+            return {}
+        return {"lead_most": self.lead.most, "lead_tick": self.lead.tick, "lead_bound": self.lead.bound}
 
     def close(self) -> None:
         """Close the socket and the log."""

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from actors.fleet import Fleet
 from actors.pilot import Pilot
 from actors.planners import PREFIX, Decider, PlannerDecider
 from actors.tracks import TableTracks, TrackTable
+from actors.witness import Witness
 from deploy.progress import Progress
 from tmc.journal import Journal
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
+from tmc.record.channels import uav_topic
+from tmc.record.writer import LogWriter
 from tmc.roster import LEARNER, Outbox, uav_name
 from tmc.station import Station
 from tmc.wire import messages as m
@@ -22,26 +26,47 @@ if TYPE_CHECKING:
     from learner.trainer import Trainer
 
 
+Testify = Callable[[int, Any], None]
+"""Takes UAV i's overfly.Witness to the moves of a record."""
+
+
 class LockStep:
-    """A mission without sockets. `keep` gets every outbox of the station before its messages are delivered."""
+    """A mission without sockets. `keep` gets every outbox of the station before its messages are delivered.
+
+    `testify`: who wants to know what the UAVs decide by; None outside of trials.
+    """
 
     def __init__(
-        self, world: World, policy: bytes | None, keep: Callable[[Outbox], None], trainer: Trainer | None = None
+        self,
+        world: World,
+        policy: bytes | None,
+        keep: Callable[[Outbox], None],
+        trainer: Trainer | None = None,
+        testify: Testify | None = None,
     ) -> None:
         config = world.config
-        self.world, self.keep, self.trainer = world, keep, trainer
+        self.world, self.keep, self.trainer, self.testify = world, keep, trainer, testify
         self.station = Station(world, "lockstep", learning=trainer is not None, policy=policy)
         observer = self.station.observer
         table = TrackTable(config.team.size, config.training.ticks)
         planner = PlannerDecider(world, config.team.pilot) if config.team.pilot.startswith(PREFIX) else None
         decider = _decider_maker(world, observer)
-        pilots = [
-            Pilot(world, i, 1, TableTracks(table, i), observer, decider, planner) for i in range(config.team.size)
-        ]
+        self._witnesses = [Witness(observer) for _ in range(config.team.size)]
+
+        def pilot(i: int) -> Pilot:
+            tracks, watch = TableTracks(table, i), self._witnesses[i].watch
+            if testify is None:
+                return Pilot(world, i, 1, tracks, observer, decider, planner)
+            watched = watch(planner) if planner else None
+            return Pilot(world, i, 1, tracks, observer, lambda model: watch(decider(model)), watched)
+
+        pilots = [pilot(i) for i in range(config.team.size)]
         self.fleet = Fleet(pilots, self._exchange)
         self._minibatches: list[m.Minibatch] = []
 
     def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
+        if self.testify is not None and isinstance(message, m.Record):
+            self.testify(uav, self._witnesses[uav].testify(message))
         self.station.handle(uav_name(uav), message, 0.0)
         return self._take()
 
@@ -112,11 +137,30 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
         trainer = start(config, world.grid)
     journal = Journal(out, world, "lockstep")
     try:
-        mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer)
-        mission.run(progress.show)
+        with _testimonies(world, out) as testify:
+            mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, testify)
+            mission.run(progress.show)
         if trainer is not None:
             from learner.service import write_policy  # noqa: PLC0415
 
             write_policy(out / "policies" / "final.onnx", trainer.policy()[1])
     finally:
         journal.writer.close()
+
+
+@contextmanager
+def _testimonies(world: World, out: Path) -> Iterator[Testify | None]:
+    """Where witnesses testify: in the logs that the UAVs would write; nowhere outside of trials."""
+    config = world.config
+    if not config.trial.witness:
+        yield None
+        return
+    with ExitStack() as stack:
+        names = [uav_name(i) for i in range(config.team.size)]
+        facts = {"run": "lockstep"}
+        logs = [stack.enter_context(LogWriter(out / f"{n}.mcap", n, config.journal, facts)) for n in names]
+
+        def testify(uav: int, message: Any) -> None:
+            logs[uav].write(uav_topic(uav, "witness"), message)
+
+        yield testify

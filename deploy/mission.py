@@ -66,7 +66,9 @@ def check(config: Config, policy: bytes | None = None) -> World:
 class Mission:
     """One mission in its run folder; `world` comes from `check`."""
 
-    def __init__(self, world: World, out: Path, command: str, policy: bytes | None = None) -> None:
+    def __init__(
+        self, world: World, out: Path, command: str, policy: bytes | None = None, progress: Progress | None = None
+    ) -> None:
         config = world.config
         self.world, self.config, self.out, self.command = world, config, out, command
         self.policy: Path | None = None
@@ -75,7 +77,7 @@ class Mission:
             self.policy.parent.mkdir(parents=True, exist_ok=True)
             self.policy.write_bytes(policy)
         (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
-        self.progress = Progress(config, self.world.law.cells.size, bound_of(self.world))
+        self.progress = progress or Progress(config, self.world.law.cells.size, bound_of(self.world))
         self._start = time.time()
         self._ended: dict[str, Any] = {}
         self._write_run(self._ended)

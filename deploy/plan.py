@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import deploy
+from actors.planners import PREFIX
 from tmc.kernel.config import Config
 
 ROOT = Path(deploy.__file__).resolve().parent.parent
@@ -17,39 +18,50 @@ ROOT = Path(deploy.__file__).resolve().parent.parent
 
 @dataclass(frozen=True)
 class Child:
-    """One process: its name, its command, whether it may be started again, and whether its end ends the mission."""
+    """One process: its name, its command, whether it may be started again, and whether its end ends the mission.
+
+    `forked`: the forkserver starts it, and `command` holds the arguments of `python -m actors` alone.
+    """
 
     name: str
     command: tuple[str, ...]
     restart: bool
     leads: bool = False
+    forked: bool = False
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The processes of a mission on this machine, and what they share."""
+    """The processes of a mission on this machine, and what they share. `preload`: what all UAVs import."""
 
     children: tuple[Child, ...]
     endpoint: str
     tracks: Path
     scratch: Path
+    preload: tuple[str, ...] = ()
 
 
-def make(config: Config, out: Path, *, policy: Path | None) -> Plan:
-    """TMC, N UAVs and, unless a fixed policy or a planner flies, the learner; sockets lie in a folder of their own."""
+def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) -> Plan:
+    """TMC, N UAVs and, unless a fixed policy or a planner flies, the learner; sockets lie in a folder of their own.
+
+    `table`: the UAVs share a table of tracks; otherwise they tell each other by beacon.
+    """
     scratch = Path(tempfile.mkdtemp(prefix="overfly-", dir=_short_folder()))
     endpoint, tracks = f"ipc://{scratch}/sync", scratch / "tracks"
     flies_fixed = policy is not None or config.team.pilot != "policy"
     common = ("--parent", str(os.getpid()), "--out", str(out))
-    tmc = [*_module("tmc"), "--config", str(out / "config.json"), "--bind", endpoint, "--tracks", str(tracks), *common]
+    tmc = [*_module("tmc"), "--config", str(out / "config.json"), "--bind", endpoint, *common]
+    tmc += ["--tracks", str(tracks)] if table else []
     tmc += ["--policy", str(policy)] if policy else []
     children = [Child("tmc", tuple(tmc), restart=False, leads=True)]
     if not flies_fixed:
         children.append(Child("learner", (*_module("learner"), "--connect", endpoint, *common), restart=True))
     for i in range(config.team.size):
-        command = (*_module("actors"), "--id", str(i), "--connect", endpoint, *common)
-        children.append(Child(f"uav-{i:03d}", command, restart=True))
-    return Plan(tuple(children), endpoint, tracks, scratch)
+        command = ("--id", str(i), "--connect", endpoint, "--out", str(out))
+        children.append(Child(f"uav-{i:03d}", command, restart=True, forked=True))
+    # A planner flies without ONNX Runtime, 16 MB of memory that nobody would use.
+    preload = () if config.team.pilot.startswith(PREFIX) else ("actors.policy",)
+    return Plan(tuple(children), endpoint, tracks, scratch, preload)
 
 
 def _module(name: str) -> tuple[str, ...]:

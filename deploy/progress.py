@@ -75,6 +75,7 @@ class Progress:
         left = self._total - s.ticks
         parts += [f"{clock(left / ticks)} left"] if ticks > 0 and left else []
         parts += ["the learner catches up"] if s.phase == "learning" else []
+        parts += [f"waiting for {s.waiting}"] if s.waiting and self._stands_still() else []
         return " · ".join(parts)
 
     def _rates(self) -> tuple[float, float]:
@@ -84,6 +85,12 @@ class Progress:
         if span <= 0:
             return 0.0, 0.0
         return (recent[-1][1] - recent[0][1]) / span, (recent[-1][2] - recent[0][2]) / span
+
+    def _stands_still(self) -> bool:
+        """True when no tick was finished for two seconds: then the slow ones are named."""
+        now, ticks = self._past[-1][0], self._past[-1][1]
+        before = [past for past in self._past if past[0] < now - 2]
+        return bool(before) and before[-1][1] == ticks
 
     def note(self, text: str) -> None:
         """A line that stays."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy import plan as plans
+from deploy.forked import ForkServer, Handle, forkserver_command
 from tmc.wire import process
 
 BACKOFF = (0.1, 5.0)
@@ -20,6 +21,8 @@ STEADY = 10.0
 """Seconds up after which a crash counts as the first again."""
 TRIES = 6
 """Crashes in a row after which the run is given up."""
+OUTSIDE = {-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, process.STOPPED}
+"""Ends that somebody else brought about: the process is started again, and it does not count as a crash."""
 GRACE = 15.0
 """Seconds that processes get to leave before they are killed."""
 FINAL = {process.USAGE, process.FENCED, 78}
@@ -33,7 +36,7 @@ class MissionFailed(Exception):  # noqa: N818  the sentence for the user
 @dataclass
 class _Running:
     child: plans.Child
-    popen: subprocess.Popen[bytes] | None = None
+    handle: Handle | None = None
     started: float = 0.0
     crashes: int = 0
     restarts: int = 0
@@ -46,6 +49,9 @@ class Supervisor:
     def __init__(self, plan: plans.Plan, out: Path, threads: int, say: Callable[[str], None]) -> None:
         self.plan, self.out, self.threads, self.say = plan, out, threads, say
         self.running = [_Running(child) for child in plan.children]
+        room = max((len(" ".join(c.command)) for c in plan.children if c.forked), default=0) + 64
+        command, environment = forkserver_command(out, plan.preload, room), plans.environment("actors", 1)
+        self._forkserver = ForkServer(command, environment, self.log_of("forkserver"))
 
     def start(self) -> None:
         """Start everybody."""
@@ -58,10 +64,14 @@ class Supervisor:
         return self.out / "logs" / f"{name}.txt"
 
     def _start(self, running: _Running) -> None:
-        child = running.child
+        child, log = running.child, self.log_of(running.child.name)
+        running.started = time.monotonic()
+        if child.forked:
+            running.handle = self._forkserver.start(child.name, child.command, log)
+            return
         threads = self.threads if child.name == "learner" else 1
-        with self.log_of(child.name).open("ab") as output:
-            running.popen = subprocess.Popen(
+        with log.open("ab") as output:
+            running.handle = subprocess.Popen(
                 child.command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
@@ -69,31 +79,32 @@ class Supervisor:
                 env=plans.environment(child.name, threads),
                 start_new_session=True,  # Ctrl-C in the terminal is for the supervisor, who ends all in order
             )
-        running.started = time.monotonic()
 
     def watch(self) -> bool:
         """Look after the processes once; True when the mission is over. Raises MissionFailed."""
         for running in self.running:
-            if running.popen is None:
+            if running.handle is None:
                 if time.monotonic() >= running.again_at:
                     self._start(running)
                 continue
-            code = running.popen.poll()
+            code = running.handle.poll()
             if code == 0 and running.child.leads:
                 return True
             if code:
-                self._crashed(running, code)
+                self._ended(running, code)
         return False
 
-    def _crashed(self, running: _Running, code: int) -> None:
+    def _ended(self, running: _Running, code: int) -> None:
+        """A process ended that should not have: start it again, or give up."""
         child, up = running.child, time.monotonic() - running.started
-        running.crashes = 1 if up > STEADY else running.crashes + 1
+        crashed = code not in OUTSIDE
+        running.crashes = crashed + (0 if up > STEADY else running.crashes)
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         log = self.log_of(child.name)
         if not child.restart or code in FINAL or running.crashes >= TRIES:
             raise MissionFailed(f"{child.name} {how}{self._reason(log)}; its output is in {log}")
-        delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1])
-        running.popen, running.again_at = None, time.monotonic() + delay
+        delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1]) if crashed else BACKOFF[0]
+        running.handle, running.again_at = None, time.monotonic() + delay
         running.restarts += 1
         self.say(f"{child.name} {how}; it is started again (log: {log})")
 
@@ -108,32 +119,39 @@ class Supervisor:
         for leads in (False, True):
             group = [r for r in self.running if r.child.leads is leads]
             for running in group:
-                if running.popen is not None and running.popen.poll() is None:
-                    running.popen.terminate()
+                if running.handle is not None:
+                    running.handle.send_signal(signal.SIGTERM)
             self.wait(GRACE, group)
 
     def wait(self, patience: float, group: list[_Running] | None = None) -> None:
         """Wait for everybody (or a group) to leave; kill who has not after `patience` seconds."""
         until = time.monotonic() + patience
         for running in self.running if group is None else group:
-            if running.popen is None:
+            if running.handle is None:
                 continue
             try:
-                running.popen.wait(max(0.0, until - time.monotonic()))
+                running.handle.wait(max(0.0, until - time.monotonic()))
             except subprocess.TimeoutExpired:
                 self.say(f"{running.child.name} did not leave in {patience:g} s and is killed")
-                running.popen.kill()
-                running.popen.wait()
+                running.handle.send_signal(signal.SIGKILL)
+                running.handle.wait()
+
+    def pids(self) -> dict[str, int]:
+        """The processes that run now, and that of the forkserver."""
+        handles = {r.child.name: r.handle for r in self.running if r.handle is not None and r.handle.poll() is None}
+        found = {name: handle.pid for name, handle in handles.items()} | {"forkserver": self._forkserver.pid}
+        return {name: pid for name, pid in found.items() if pid is not None}
 
     def exit_codes(self) -> dict[str, int | None]:
         """The last exit code of each process, None where it never ended."""
-        return {r.child.name: None if r.popen is None else r.popen.returncode for r in self.running}
+        return {r.child.name: None if r.handle is None else r.handle.returncode for r in self.running}
 
     def restarts(self) -> dict[str, int]:
         """How often each process was started again."""
         return {r.child.name: r.restarts for r in self.running if r.restarts}
 
     def close(self) -> None:
-        """Remove what the processes shared."""
+        """End the forkserver, and remove what the processes shared."""
+        self._forkserver.close()
         with contextlib.suppress(OSError):
             shutil.rmtree(self.plan.scratch)

@@ -43,9 +43,11 @@ def exchange(flight: Flight, done: Exchange, policy: int) -> list[Entry]:
 
 def truth(flight: Flight, fresh: Truth, steps: int, updates: int, policy: int) -> list[Entry]:
     """What became final: uncertainty and mean reward by tick, and in scenario I the new events."""
+    ticks_present = ((r, len(flight.present(t))) for t, r in enumerate(fresh.reward, fresh.first))
+    rewards = [float(r.sum()) / max(n, 1) for r, n in ticks_present]
     values = {
         "episode": flight.episode, "first": fresh.first, "steps": steps, "updates": updates, "policy": policy,
-        "uncertainty": fresh.uncertainty, "reward": [float(r.mean()) for r in fresh.reward],
+        "uncertainty": fresh.uncertainty, "reward": rewards,
     }  # fmt: skip
     entries = [Entry("/tmc/metrics", values)]
     if fresh.events:

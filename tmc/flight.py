@@ -17,7 +17,10 @@ from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge, step_events
 from tmc.kernel.world import World
 from tmc.replay import Replay
-from tmc.wire.messages import EMPTY, Record
+from tmc.wire.messages import EMPTY, Begin, Map, Record
+
+GONE = 65_535
+"""Stands for the cell of a UAV that was lost, in the ticks after its last record."""
 
 
 class RefusedError(ValueError):
@@ -66,6 +69,8 @@ class Flight:
         self.own_rewards = np.zeros((self.T + 1, self.N), "<f4")
         self.base = np.zeros((self.T + 1, self.N), np.int64)
         self.reported = [-1] * self.N
+        self.lost: dict[int, int] = {}
+        """Lost UAVs, and the tick of their last record."""
         self.cells[0] = self.starts
         # The exchange clock: what the TMC believes, and what it knows each UAV to believe.
         self.version = version
@@ -86,8 +91,8 @@ class Flight:
 
     @property
     def over(self) -> bool:
-        """All ticks are final and answered."""
-        return self.done == self.T and self.next_exchange > self.T
+        """All ticks are final and answered, or nobody is left to fly them."""
+        return self.done == self.T and (self.next_exchange > self.T or len(self.lost) == self.N)
 
     def accept(self, record: Record) -> None:
         """Take a UAV's next record; raises RefusedError when it does not follow from what is known."""
@@ -107,6 +112,8 @@ class Flight:
                 self.beliefs[i, k] = max(self.beliefs[i, k], tick)
 
     def _check(self, r: Record) -> None:
+        if r.uav in self.lost:
+            raise RefusedError(f"UAV {r.uav} was declared lost in this episode")
         if r.first != self.reported[r.uav] + 1:
             raise RefusedError(f"record of UAV {r.uav} starts at tick {r.first}, expected {self.reported[r.uav] + 1}")
         due = (
@@ -152,7 +159,7 @@ class Flight:
         done = []
         while self.next_exchange <= self.T:
             t = self.next_exchange
-            due = [i for i in range(self.N) if self.world.config.due(i, t)]
+            due = [i for i in range(self.N) if i not in self.lost and self.world.config.due(i, t)]
             if any(self.reported[i] < t for i in due):
                 break
             if due:
@@ -187,17 +194,41 @@ class Flight:
             if k >= 0:
                 self.believed[k] = max(self.believed[k], tick)
 
+    def answer(self, exchange: Exchange, policy: int, sequence: int) -> Map:
+        """The TMC's answer at an exchange; `sequence`: the record that it answers."""
+        last_visit, active = exchange.last_visit, exchange.active
+        return Map(self.episode, exchange.tick, exchange.version, policy, sequence, last_visit, active)
+
+    def begin(self, i: int, policy: int, sequence: int) -> Begin:
+        """Fly from the last record that the TMC has of UAV i; at the start of the episode, from its beginning."""
+        shipped, lost = self.reported[i], np.array([*self.lost], "<u2")
+        tick = max(shipped, 0)
+        belief, track = self.beliefs[i].copy(), self.cells[: tick + 1, i].copy()
+        return Begin(self.episode, tick, shipped, sequence, self.version, policy, belief, track, lost)
+
     def uncertainty(self, last_visit: NDArray[np.uint16], t: int) -> NDArray[np.float64]:
         """u_k(t) over the monitored cells, scenario II."""
         return self.world.law.values(last_visit, t, self.factor)
 
     def settle(self) -> Truth:
         """Run the truth clock up to the slowest UAV; returns what became final since the last call."""
-        self._settle(min(self.reported))
+        self._settle(min((t for i, t in enumerate(self.reported) if i not in self.lost), default=self.T))
         truth, self._fresh = self._fresh, Truth(self.done + 1, [], [], [])
         for t, reward in enumerate(truth.reward, truth.first):
-            self.replay.add_row(self.episode, t, self.cells[t], self.actions[t], reward, self.base[t])
+            # A lost UAV may have been seen until its next exchange, and that seeing remembered until the one after it.
+            sure = not any(last < t <= last + 2 * self.world.config.T_u for last in self.lost.values())
+            self.replay.add_row(self.episode, t, self.cells[t], self.actions[t], reward, self.base[t], sure=sure)
         return truth
+
+    def lose(self, uav: int) -> int:
+        """Go on without a UAV: its visits count up to its last record, the tick of which is returned."""
+        last = self.lost[uav] = self.reported[uav]
+        self.cells[last + 1 :, uav] = GONE
+        return last
+
+    def present(self, t: int) -> list[tuple[int, int]]:
+        """(uav, cell) of those who were not lost at tick t."""
+        return [(i, cell) for i, cell in enumerate(self.cells[t].tolist()) if cell != GONE]
 
     def _settle(self, upto: int) -> None:
         while self.done < upto:
@@ -214,7 +245,7 @@ class Flight:
     def _visit(self, t: int) -> NDArray[np.float64]:
         """Rewards of all UAVs at tick t (Sec. III-B), shape (N,), then the visits of that tick."""
         index, reward = self.world.law.index_list, np.zeros(self.N)
-        for i, cell in enumerate(self.cells[t].tolist()):
+        for i, cell in self.present(t):
             k = index[cell]
             if t:
                 reward[i] = self._reward(t, i, cell, k)
@@ -247,6 +278,6 @@ class Flight:
             return float(self.uncertainty(self.last_visit, t).sum())
         if t:
             arrivals = self.world.arrivals(self.episode, t)
-            self.active, new = step_events(self.active, self.cells[t].tolist(), arrivals)
+            self.active, new = step_events(self.active, [cell for _, cell in self.present(t)], arrivals)
             self._fresh.events.extend((t, int(k)) for k in new)
         return float(self.active.sum())

@@ -67,7 +67,7 @@ class Replay:
         self.frames = Ring(frames, (R + 7) // 8 if self._events else R, "u1" if self._events else "u2")
         self.frame_tick = Ring(frames, 0, "u2")
         self.starts, self.ends = Ring(self._starts_kept, 0, "i8"), Ring(self._starts_kept, 0, "i8")
-        self.rows_in = self.frames_in = self.starts_in = 0
+        self.rows_in = self.frames_in = self.starts_in = self._sure_from = 0
         self._factors: dict[int, NDArray[np.float64]] = {}
 
     def __len__(self) -> int:
@@ -89,9 +89,15 @@ class Replay:
         actions: NDArray[np.uint8],
         rewards: Floats,
         base: Ints,
+        *,
+        sure: bool = True,
     ) -> None:
-        """Tick `tick` of `episode`, ticks in order from 0. Shapes (N,): actions and rewards that led to this tick."""
+        """Tick `tick` of `episode`, ticks in order from 0. Shapes (N,): actions and rewards that led to this tick.
+
+        A cell off the grid stands for a UAV that was lost. A row that is not `sure` is part of no transition.
+        """
         row = self.rows_in
+        self._sure_from = self._sure_from if sure else row + 1
         self.cells[row], self.actions[row], self.rewards[row], self.base[row] = cells, actions, rewards, base
         self.tick[row], self.episode[row] = tick, episode
         self.rows_in += 1
@@ -100,8 +106,10 @@ class Replay:
         oldest = tick - self.n_step
         newest = tick - 1 if tick == self.world.config.training.ticks else oldest  # a time limit cuts n-step sums short
         for start_tick in range(max(0, oldest), newest + 1):
-            self.starts[self.starts_in], self.ends[self.starts_in] = row - tick + start_tick, row
-            self.starts_in += 1
+            start = row - tick + start_tick
+            if start >= self._sure_from:
+                self.starts[self.starts_in], self.ends[self.starts_in] = start, row
+                self.starts_in += 1
 
     def _remember(self, episode: int) -> None:
         """Keep the initial map of an episode, and drop those of episodes of which no row is left."""
@@ -117,8 +125,11 @@ class Replay:
         u = uniforms(self.world.config.training.seed, Stream.REPLAY, 2 * batch, tick=number)
         held = min(self.starts_in, self._starts_kept)
         place = self.starts_in - held + (u[:batch] * held).astype(np.int64)
-        uav = (u[batch:] * self.world.config.team.size).astype(np.int64)
-        return self.rebuild(self.starts[place].astype(np.int64), self.ends[place].astype(np.int64), uav)
+        end = self.ends[place].astype(np.int64)
+        present = self.cells[end] < self.world.grid.size
+        order = np.argsort(~present, axis=1, kind="stable")  # those who were not lost come first
+        uav = order[np.arange(batch), (u[batch:] * present.sum(axis=1)).astype(np.int64)]
+        return self.rebuild(self.starts[place].astype(np.int64), end, uav)
 
     def rebuild(self, start: Ints, end: Ints, uav: Ints) -> Sample:
         """Transitions of UAVs `uav` from rows `start` to rows `end`. Shapes (B,)."""
@@ -139,13 +150,17 @@ class Replay:
     def observe(self, row: Ints, uav: Ints) -> tuple[Floats, NDArray[np.uint8]]:
         """o_i at these rows, exactly as the UAVs saw it, and the actions they would allow. Shapes (B,)."""
         batch = np.arange(row.size)
-        team = self.cells[row].astype(np.int64)
+        team = self._team(row)
         cells = team[batch, uav]
         sensed = self.observer.sensed(cells, team, uav)
         obs = self.observer.observe_batch(cells, team, sensed, self.belief(row, uav))
         if not self.world.config.exploration.mask_blocked:
             return obs, np.ones((row.size, N_ACTIONS), np.uint8)
         return obs, self.observer.allowed_batch(cells, team, sensed)
+
+    def _team(self, row: Ints) -> Ints:
+        """Cells of the team at these rows, (B, N); K for a UAV that was lost."""
+        return np.minimum(self.cells[row].astype(np.int64), self.world.grid.size)
 
     def belief(self, row: Ints, uav: Ints) -> NDArray[np.float64]:
         """U_i over the monitored cells, shape (B, R), float64."""
@@ -163,12 +178,12 @@ class Replay:
     def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
         """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers."""
         tick = self.tick[row].astype(np.int64)
-        index, R = self.world.law.index, last_visit.shape[1]
+        index, R = np.append(self.world.law.index, -1), last_visit.shape[1]
         padded = np.concatenate([last_visit, np.zeros((row.size, 1), np.uint16)], axis=1)
         for k in range(1, int((tick - since).max(initial=0)) + 1):
             live = np.flatnonzero(since + k <= tick)
             t = (since + k)[live]
-            team = self.cells[row[live] - (tick[live] - t)].astype(np.int64)
+            team = self._team(row[live] - (tick[live] - t))
             cells = team[np.arange(live.size), uav[live]]
             known = self.observer.sensed(cells, team, uav[live])
             known[np.arange(live.size), uav[live]] = True

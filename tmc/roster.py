@@ -47,12 +47,38 @@ def name_some(names: list[str]) -> str:
     return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
 
 
-def silent(members: list[Member], waited_for: list[str], now: float, patience: float) -> list[str]:
-    """Those of the UAVs waited for who were not heard of for `patience` seconds, each named once in its silence."""
-    found = []
-    for name in waited_for:
-        member = members[int(name.removeprefix("uav-"))]
-        if not member.named and member.heard and now - member.heard > patience:
-            member.named = True
-            found.append(name)
+def silent(members: list[Member], now: float, patience: float) -> list[int]:
+    """UAVs with a process that was not heard of for `patience` seconds, each named once in its silence."""
+    found = [i for i in long_silent(members, now, patience) if not members[i].named]
+    for i in found:
+        members[i].named = True
     return found
+
+
+def long_silent(members: list[Member], now: float, patience: float) -> list[int]:
+    """UAVs with a process that was not heard of for `patience` seconds."""
+    return [i for i, m in enumerate(members) if m.life >= 0 and now - m.heard > patience]
+
+
+Problem = tuple[str, str] | None
+"""Error code and sentence, or None when all is well."""
+
+
+def hello_problem(members: list[Member], sender: str, hello: m.Hello) -> Problem:
+    """Why a UAV cannot say hello: another name than its own, or a life that a newer one took the place of."""
+    if not 0 <= hello.uav < len(members) or sender != uav_name(hello.uav):
+        return "refused", f"{sender} is no name for UAV {hello.uav} of a team of {len(members)}"
+    if hello.life in members[hello.uav].past:
+        return "fenced", f"a newer process flies {sender}: leave"
+    return None
+
+
+def record_problem(members: list[Member], sender: str, record: m.Record) -> Problem:
+    """Why a UAV cannot ship a record: not its own, not known here, or of an older life."""
+    if not 0 <= record.uav < len(members) or sender != uav_name(record.uav):
+        return "refused", f"{sender} cannot ship a record of UAV {record.uav}"
+    if members[record.uav].life < 0:
+        return "state", f"{sender} is not known here: say hello first"
+    if record.life != members[record.uav].life:
+        return "fenced", f"a newer process flies {sender}: leave"
+    return None

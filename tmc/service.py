@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -32,6 +33,7 @@ class Service:
         self._where: dict[str, tuple[zmq.Socket[Any], bytes]] = {}
         self._here: set[str] = set()
         self._over: float | None = None
+        self._taken: Counter[str] = Counter()
 
     def serve(self, stop: Callable[[], bool]) -> bool:
         """The main loop. True when the mission came to its end, False when it was stopped."""
@@ -45,8 +47,10 @@ class Service:
             self._post(self.station.out.take())
             self.journal.writer.maybe_flush()
             if self._finished():
+                self._sum_up()
                 return True
         self._say_goodbye("the TMC was stopped")
+        self._sum_up()
         return False
 
     def _drain(self, sock: zmq.Socket[Any]) -> None:
@@ -68,6 +72,7 @@ class Service:
             self.station.reject(sender, error.code, str(error))
             return
         self._here.add(sender)
+        self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
         self.station.handle(sender, message, time.monotonic())
@@ -92,6 +97,11 @@ class Service:
     def _say_goodbye(self, reason: str) -> None:
         for sock, identity in self._where.values():
             sockets.send(sock, End(reason), identity)
+
+    def _sum_up(self) -> None:
+        """What the radio carried, as one line of the log."""
+        counts = " · ".join(f"{name} {count}" for name, count in sorted(self._taken.items()))
+        self.journal.writer.log("info", f"messages taken: {counts}")
 
     def close(self) -> None:
         """Close the sockets and the journal."""

@@ -10,7 +10,8 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from tmc import entries
+from tmc import entries, roster
+from tmc.feed import WINDOW, Feed
 from tmc.flight import Exchange, Flight, RefusedError, Truth
 from tmc.kernel.config import flat
 from tmc.kernel.observation import Observer
@@ -19,7 +20,7 @@ from tmc.kernel.world import World
 from tmc.limiter import Limiter
 from tmc.policies import Policies
 from tmc.replay import Replay
-from tmc.roster import LEARNER, Member, Outbox, name_some, silent, uav_name
+from tmc.roster import LEARNER, Member, Outbox, uav_name
 from tmc.wire import messages as m
 
 
@@ -39,15 +40,14 @@ class Station:
         self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
         self.roster = [Member() for _ in range(config.team.size)]
         self.flight: Flight | None = None
-        self.version = self.ticks = self.episodes = self.rejected = 0
+        self.version = self.ticks = self.steps = self.episodes = self.rejected = 0
         self.blocked = self.blocked_by_uav = 0
         self.uncertainty = self.episode_uncertainty = self.loss = 0.0
         self.policies = Policies()
-        self.learner_life = -1
+        self.feed = Feed(self.replay, self.limiter, config.dqn.batch)
         self.out = Outbox()
         self._held: list[tuple[str, m.Message]] = []
-        self._requests: list[int] = []
-        self._ended = self._learner_told = False
+        self._ended = False
         if policy is not None:
             self._take_policy(1, policy, 0, 0.0)
 
@@ -68,7 +68,7 @@ class Station:
         return m.Status(
             self.phase, flight.episode if flight else self.episodes, max(flight.done, 0) if flight else 0, self.ticks,
             self.limiter.updates, self.policies.newest, self.loss, self.uncertainty, self.episode_uncertainty,
-            self.blocked, self.rejected, name_some(self.waiting_for()),
+            self.blocked, self.rejected, roster.name_some(self.waiting_for()),
         )  # fmt: skip
 
     def waiting_for(self) -> list[str]:
@@ -76,10 +76,15 @@ class Station:
         if self.flight is None:
             if self.phase != "gathering":
                 return []
-            missing = [uav_name(i) for i, member in enumerate(self.roster) if member.life < 0]
+            missing = [uav_name(i) for i in self._away()]
             return missing + ([LEARNER] if self.learning and not self.policies.newest else [])
         flight, t = self.flight, self.flight.next_exchange
-        return [uav_name(i) for i in range(flight.N) if self.config.due(i, t) and flight.reported[i] < t]
+        due = (i for i in range(flight.N) if i not in flight.lost and self.config.due(i, t))
+        return [uav_name(i) for i in due if flight.reported[i] < t]
+
+    def _away(self) -> list[int]:
+        """UAVs without a process."""
+        return [i for i, member in enumerate(self.roster) if member.life < 0]
 
     # Messages in.
 
@@ -106,15 +111,15 @@ class Station:
             if not self.learning or sender != LEARNER:
                 self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
                 return
-            self._learner_hello(sender, hello, welcome)
+            self.feed.welcome(hello)
+            self._send(sender, welcome)
+            self._finish_if_done()
             return
-        if not 0 <= hello.uav < len(self.roster) or sender != uav_name(hello.uav):
-            self.reject(sender, "refused", f"{sender} is no name for UAV {hello.uav} of a team of {len(self.roster)}")
+        problem = roster.hello_problem(self.roster, sender, hello)
+        if problem is not None:
+            self.reject(sender, *problem)
             return
         member = self.roster[hello.uav]
-        if hello.life in member.past:
-            self.reject(sender, "fenced", f"a newer process flies {sender}: leave")
-            return
         if member.life not in {-1, hello.life}:
             member.past.add(member.life)
             self.out.notes.append(("WARNING", f"{sender} is back with a new process"))
@@ -123,44 +128,28 @@ class Station:
         if self.phase == "done" or self._ended:
             self._send(sender, m.End("the mission is over"))
         elif self.flight is not None:
-            self._resume(hello.uav)
+            if hello.uav not in self.flight.lost:  # who was lost is back with the next episode
+                self._resume(hello.uav)
         else:
             self._try_begin()
 
-    def _learner_hello(self, sender: str, hello: m.Hello, welcome: m.Welcome) -> None:
-        """A learner is here, perhaps back from an older checkpoint: what it lost since is owed to it again."""
-        self._requests.clear()  # it asks again once it is welcome
-        if hello.life != self.learner_life:
-            self.learner_life, self._learner_told = hello.life, False
-            self.limiter.updates = min(self.limiter.updates, hello.updates)
-        self._send(sender, welcome)
-        if self._ended:
-            self._finish_if_done()
-
     def _record(self, sender: str, record: m.Record, now: float) -> None:
-        if not 0 <= record.uav < len(self.roster) or uav_name(record.uav) != sender:
-            self.reject(sender, "refused", f"{sender} cannot ship a record of UAV {record.uav}")
+        problem = roster.record_problem(self.roster, sender, record)
+        if problem is not None:
+            self.reject(sender, *problem)
             return
         member = self.roster[record.uav]
-        if member.life < 0:
-            self.reject(sender, "state", f"{sender} is not known here: say hello first")
-            return
-        if record.life != member.life:
-            self.reject(sender, "fenced", f"a newer process flies {sender}: leave")
-            return
         member.heard, member.named = now, False
+        flight = self.flight
+        if flight is not None and record.uav in flight.lost:
+            return  # too late: the others went on without it
         if record.sequence < member.sequence:  # a repeat: it is known, and perhaps answered
             if member.answer is not None and member.answer.sequence == record.sequence:
                 self._send(sender, member.answer)
             return
-        if self.flight is None or record.episode != self.flight.episode or record.sequence > member.sequence:
+        if flight is None or record.episode != flight.episode or record.sequence > member.sequence:
             self.reject(sender, "state", f"record {record.sequence} of {sender} is not the next one")
             return
-        self._accept(sender, record, member)
-
-    def _accept(self, sender: str, record: m.Record, member: Member) -> None:
-        flight = self.flight
-        assert flight is not None
         try:
             flight.accept(record)
         except RefusedError as refused:
@@ -168,6 +157,10 @@ class Station:
             return
         member.sequence += 1
         self.out.entries.append(entries.flight_record(record))
+        self._go_on(flight)
+
+    def _go_on(self, flight: Flight) -> None:
+        """Answer the exchanges that can be held, journal what became final, and end the episode when it is over."""
         for exchange in flight.exchanges():
             self._answer(flight, exchange)
         self._journal_truth(flight, flight.settle())
@@ -180,10 +173,7 @@ class Station:
         self.version = exchange.version
         self.out.entries += entries.exchange(flight, exchange, self.policies.newest)
         for i in exchange.uavs:
-            answer = m.Map(
-                flight.episode, exchange.tick, exchange.version, self.policies.newest, self.roster[i].sequence - 1,
-                exchange.last_visit, exchange.active,
-            )  # fmt: skip
+            answer = flight.answer(exchange, self.policies.newest, self.roster[i].sequence - 1)
             self._held.append((uav_name(i), answer))
 
     def _journal_truth(self, flight: Flight, truth: Truth) -> None:
@@ -191,10 +181,11 @@ class Station:
             return
         moves = len(truth.uncertainty) - (truth.first == 0)
         self.ticks += moves
+        self.steps += sum(len(flight.present(t)) for t in range(max(truth.first, 1), flight.done + 1))
         self.limiter.insert(moves, len(self.replay))
         self.uncertainty = truth.uncertainty[-1]
-        steps, updates = self.ticks * flight.N, self.limiter.updates
-        self.out.entries += entries.truth(flight, truth, steps, updates, self.policies.newest)
+        updates = self.limiter.updates
+        self.out.entries += entries.truth(flight, truth, self.steps, updates, self.policies.newest)
 
     # Episodes.
 
@@ -204,26 +195,21 @@ class Station:
 
     def _begin_episode(self) -> None:
         episode = self.episodes + 1
+        if all(member.life < 0 for member in self.roster):
+            return  # all are lost: gather again
         self.flight = flight = Flight(self.world, self.reward, self.replay, episode, self.version)
+        for i in self._away():
+            flight.lose(i)
         self._journal_episode(flight, "begin")
         for i, member in enumerate(self.roster):
             member.answer = None
-            self._held.append((uav_name(i), self._begin_message(flight, i)))
+            self._held.append((uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence)))
         self._release()
-
-    def _begin_message(self, flight: Flight, i: int) -> m.Begin:
-        """Fly from the last record that the TMC has; at the start of an episode, from its beginning."""
-        shipped = flight.reported[i]
-        tick = max(shipped, 0)
-        return m.Begin(
-            flight.episode, tick, shipped, self.roster[i].sequence, flight.version, self.policies.newest,
-            flight.beliefs[i].copy(), flight.cells[: tick + 1, i].copy(),
-        )  # fmt: skip
 
     def _resume(self, i: int) -> None:
         flight, member = self.flight, self.roster[i]
         assert flight is not None
-        self._send(uav_name(i), self._begin_message(flight, i))
+        self._send(uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence))
         if member.answer is not None and member.answer.tick == flight.reported[i]:
             self._send(uav_name(i), member.answer)
 
@@ -240,16 +226,16 @@ class Station:
             self._finish_if_done()
 
     def _journal_episode(self, flight: Flight, phase: str) -> None:
-        steps, updates, epsilon = self.ticks * flight.N, self.limiter.updates, self.config.epsilon(flight.episode)
-        self.out.entries.append(entries.episode(flight, phase, epsilon, steps, updates))
+        epsilon = self.config.epsilon(flight.episode)
+        self.out.entries.append(entries.episode(flight, phase, epsilon, self.steps, self.limiter.updates))
 
     def _finish_if_done(self) -> None:
         """Send everybody home once the last episode is over and the learner has caught up."""
         if self.phase != "done":
             return
         goodbye = m.End("the mission is over")
-        if self.learning and not self._learner_told:
-            self._learner_told = True
+        if self.learning and not self.feed.told_the_end:
+            self.feed.told_the_end = True
             self._send(LEARNER, goodbye)
         if not self._ended:
             self._ended = True
@@ -272,21 +258,15 @@ class Station:
     # The learner.
 
     def _sample_request(self, sender: str, request: m.SampleRequest, _now: float) -> None:
-        if len(self._requests) >= 8:
-            self.reject(sender, "refused", "more than 8 minibatch requests in flight")
-            return
-        self._requests.append(request.request)
-        self._serve()
+        if self.feed.ask(request.request):
+            self._serve()
+        else:
+            self.reject(sender, "refused", f"more than {WINDOW} minibatch requests in flight")
 
     def _serve(self) -> None:
         """Answer minibatch requests as far as the limiter allows."""
-        while self._requests and self.limiter.owed:
-            s = self.replay.sample(self.limiter.updates, self.config.dqn.batch)
-            self.limiter.sample()
-            self._send(LEARNER, m.Minibatch(
-                self._requests.pop(0), self.episodes, self.ticks, s.observation, s.action, s.reward,
-                s.next_observation, s.discount, s.allowed,
-            ))  # fmt: skip
+        for minibatch in self.feed.serve(self.episodes, self.ticks):
+            self._send(LEARNER, minibatch)
         self._release()
         self._finish_if_done()
 
@@ -322,6 +302,12 @@ class Station:
             if i < len(self.roster) and i != beacon.uav:
                 self._send(uav_name(i), beacon)
 
+    def _alive(self, sender: str, alive: m.Alive, now: float) -> None:
+        if 0 <= alive.uav < len(self.roster) and sender == uav_name(alive.uav):
+            member = self.roster[alive.uav]
+            if alive.life == member.life:
+                member.heard, member.named = now, False
+
     def _status_request(self, sender: str, _request: m.StatusRequest, _now: float) -> None:
         self._send(sender, self.status())
 
@@ -330,12 +316,25 @@ class Station:
             self.out.notes.append(("INFO", f"{sender} leaves: {bye.reason}"))
 
     def tick(self, now: float) -> None:
-        """Name, once each, the UAVs that the others wait for and that have been silent for too long."""
-        if self.flight is not None:
-            patience, tick = self.config.comms.patience, self.flight.next_exchange
-            for name in silent(self.roster, self.waiting_for(), now, patience):
-                text = f"{name} has been silent for {patience:g} s at tick {tick}; others wait"
-                self.out.notes.append(("WARNING", text))
+        """Name, once each, the UAVs that have been silent for some time, and go on without those silent for long."""
+        flight, patience = self.flight, self.config.comms.patience
+        if flight is None:
+            return
+        for i in roster.silent(self.roster, now, patience):
+            text = f"has been silent for {patience:g} s at tick {flight.next_exchange}; others wait"
+            self.out.notes.append(("WARNING", f"{uav_name(i)} {text}"))
+        for i in roster.long_silent(self.roster, now, self.config.comms.lost_after):
+            if self.flight is flight:  # else the first of them ended the episode
+                self._lose(flight, i)
+
+    def _lose(self, flight: Flight, i: int) -> None:
+        self.roster[i].life = -1  # whoever comes back says hello first
+        last = flight.lose(i)
+        text = f"{uav_name(i)} is lost after tick {last} of episode {flight.episode}; the others go on without it"
+        self.out.notes.append(("ERROR", text))
+        for j in range(flight.N):
+            self._send(uav_name(j), m.Lost(flight.episode, i, last))
+        self._go_on(flight)
 
 
 _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {
@@ -344,6 +343,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {
     m.SampleRequest: Station._sample_request,
     m.PolicyPush: Station._policy_push,
     m.PolicyRequest: Station._policy_request,
+    m.Alive: Station._alive,
     m.Beacon: Station._beacon,
     m.StatusRequest: Station._status_request,
     m.Bye: Station._bye,

@@ -11,7 +11,10 @@ import math
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from tmc.kernel import limits
 
 
 class ConfigError(ValueError):
@@ -59,6 +62,7 @@ class Comms:
         "together", "all UAVs exchange at t mod T_u = 0, or UAV i at floor(i T_u / N)", source="Algorithm 1; Sec. II-C"
     )
     patience: float = _s(30.0, "silence after which the TMC names a UAV that others wait for", "s")
+    lost_after: float = _s(60.0, "silence after which it declares it lost, and the others go on without it", "s")
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,17 @@ class Journal:
 
 
 @dataclass(frozen=True)
+class Trial:
+    """What `overfly verify` does to a mission to put its exactness to the test; an ordinary one has none of it."""
+
+    stall: float = _s(0.0, "how long a UAV's process stalls before it says where it is; 0: never", "s")
+    stall_share: float = _s(1.0, "probability that it stalls at a tick", "1/tick")
+    stall_spread: float = _s(0.0, "stalls last from (1 - spread) to (1 + spread) times as long, at random")
+    stall_uav: int = _s(-1, "the one UAV that stalls; -1: all of them")
+    witness: bool = _s(False, "UAVs log a hash of each observation that they decide on")
+
+
+@dataclass(frozen=True)
 class Config:
     """All settings of a mission. Immutable; `check` has been passed by every instance that `build` returns."""
 
@@ -155,6 +170,7 @@ class Config:
     replay: Replay = field(default_factory=Replay)
     training: Training = field(default_factory=Training)
     journal: Journal = field(default_factory=Journal)
+    trial: Trial = field(default_factory=Trial)
 
     @property
     def T_u(self) -> int:
@@ -174,48 +190,6 @@ class Config:
         e, span = self.exploration, self.exploration.fraction * (self.training.episodes - 1)
         done = 1.0 if span <= 0 else min((episode - 1) / span, 1.0)
         return e.start + (e.end - e.start) * done
-
-
-# (key, lowest, highest): ranges that hold whatever the rest says.
-RANGES: tuple[tuple[str, float, float], ...] = (
-    ("scenario", 1, 2),
-    ("world.alpha", 1e-9, 10.0),
-    ("world.alpha_offroad", 0.0, 10.0),
-    ("team.size", 1, 1000),
-    ("team.sensing_range", 0.0, 1000.0),
-    ("comms.period", 1, 60_000),
-    ("comms.patience", 0.1, 1e6),
-    ("reward.collision", -1e6, 1e6),
-    ("reward.new_cell", -1e6, 1e6),
-    ("reward.weight", -1e6, 1e6),
-    ("exploration.start", 0.0, 1.0),
-    ("exploration.end", 0.0, 1.0),
-    ("exploration.fraction", 0.0, 1.0),
-    ("observation.radius", 1, 100),
-    ("observation.near", 0, 100),
-    ("network.kernel", 1, 64),
-    ("network.stride", 1, 64),
-    ("network.dense", 1, 65_536),
-    ("dqn.learning_rate", 1e-12, 10.0),
-    ("dqn.batch", 1, 65_536),
-    ("dqn.gamma", 0.0, 1.0),
-    ("dqn.n_step", 1, 1000),
-    ("dqn.reward_scale", 1e-9, 1e9),
-    ("dqn.target_episodes", 0, 1_000_000),
-    ("dqn.target_updates", 0, 1_000_000_000),
-    ("replay.capacity", 1, 1_000_000_000),
-    ("replay.learn_start", 1, 1_000_000_000),
-    ("replay.updates_per_tick", 0.0, 1000.0),
-    ("replay.slack", 1, 1_000_000),
-    ("training.episodes", 1, 10_000_000),
-    ("training.ticks", 1, 60_000),
-    ("training.seed", 0, 2**63 - 1),
-    ("training.push_every", 1, 1_000_000_000),
-    ("training.checkpoint_every", 1, 1_000_000_000),
-    ("training.threads", 1, 1024),
-    ("journal.flush", 0.01, 60.0),
-    ("journal.chunk", 1024, 64 * 1024 * 1024),
-)
 
 
 @dataclass(frozen=True)
@@ -246,10 +220,7 @@ SETTINGS: Mapping[str, Setting] = types.MappingProxyType({s.key: s for s in _set
 
 def get(config: Config, key: str) -> Any:
     """The value of a dotted key."""
-    value: Any = config
-    for name in key.split("."):
-        value = getattr(value, name)
-    return value
+    return attrgetter(key)(config)
 
 
 def flat(config: Config) -> dict[str, Any]:
@@ -332,17 +303,6 @@ def _as_int(value: Any) -> int:
 
 def check(config: Config) -> None:
     """Refuse impossible settings; raises ConfigError with the reason and the mend."""
-    for key, low, high in RANGES:
-        value = get(config, key)
-        if not low <= value <= high:
-            raise ConfigError(f"{key} = {value} is out of range: choose {low:g} to {high:g}")
-    if not config.network.channels or any(not 1 <= c <= 4096 for c in config.network.channels):
-        raise ConfigError("network.channels must list 1 to 4096 filters for at least one convolution")
-    if config.replay.learn_start > config.replay.capacity:
-        raise ConfigError("replay.learn_start is larger than replay.capacity, so learning would never start")
-    if config.dqn.target_episodes == 0 and config.dqn.target_updates == 0:
-        raise ConfigError("dqn.target_episodes and dqn.target_updates are both 0, so the target would never follow")
-    if config.observation.view == "ego" and config.observation.near > config.observation.radius:
-        raise ConfigError("observation.near is larger than observation.radius")
-    if config.observation.view == "whole" and config.observation.near:
-        raise ConfigError("observation.near needs observation.view = ego")
+    reason = limits.broken(config)
+    if reason is not None:
+        raise ConfigError(reason)

@@ -77,6 +77,7 @@ class Observer:
             dr = self._rows[team] - self._rows[cells][:, None]
             dc = self._cols[team] - self._cols[cells][:, None]
             near = dr * dr + dc * dc <= self.sensing * self.sensing + 1e-9
+        near &= team < self.grid.size  # K stands for a UAV that was lost
         near[np.arange(len(uav)), uav] = False
         return near
 

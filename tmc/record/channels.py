@@ -40,6 +40,7 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("/learner/policy", "overfly.Policy", "tmc", "each policy accepted, with its ONNX model"),
     Channel("/learner/metrics", "overfly.LearnerMetrics", "learner", "loss, Q values and pace of learning"),
     Channel("/uav/<id>/status", "overfly.UavStatus", "uav", "where the UAV is, how fast it flies, how long it waited"),
+    Channel("/uav/<id>/witness", "overfly.Witness", "uav", "in trials: a hash of each observation decided on"),
     Channel("/uav/<id>/fix", "foxglove.LocationFix", "uav", "position in degrees, sampled"),
     Channel("/log", "foxglove.Log", EVERY, "what the process says"),
 )

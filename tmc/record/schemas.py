@@ -32,7 +32,8 @@ TYPES: dict[str, str] = {
     "LearnerMetrics": "uint64 updates, uint32 episode, uint64 steps, double loss, double q_mean, double target_mean, "
     "double td_abs, double grad_norm, double updates_per_second, double idle_share, double wall",
     "UavStatus": "uint32 uav, uint32 episode, uint32 tick, uint32 cell, double waited, double steps_per_second, "
-    "uint32 explored, sint32 lead",
+    "uint32 explored, sint32 lead, uint32 lead_most, uint32 lead_tick, string lead_bound",
+    "Witness": "uint32 uav, uint32 episode, uint32 first, uint32 tick, fixed64* hashes",
 }
 
 
@@ -79,6 +80,7 @@ TeamMetrics = _own("TeamMetrics")
 Policy = _own("Policy")
 LearnerMetrics = _own("LearnerMetrics")
 UavStatus = _own("UavStatus")
+Witness = _own("Witness")
 
 
 @cache

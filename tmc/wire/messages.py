@@ -1,7 +1,7 @@
 """Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is sound.
 
-`docs/protocol.md` is the text to this table. Who sends what: UAV -> TMC: Hello, Record, PolicyRequest, Bye.
-TMC -> UAV: Welcome, Begin, Map, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
+`docs/protocol.md` is the text to this table. Who sends what: UAV -> TMC: Hello, Record, Alive, PolicyRequest,
+Bye. TMC -> UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
 TMC -> learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status.
 UAV -> UAV, passed on by the TMC where the two share no memory: Beacon.
 """
@@ -59,7 +59,7 @@ class Begin(Message):
     """Fly from here: a new episode (`shipped` = -1, tick 0), or the flight of a lost process taken up again.
 
     `track` (u16) is the UAV's own flight so far, a cell for each of the ticks 0..`tick`; `last_visit` (u16, one a
-    monitored cell) is what it knew of the map at `tick`.
+    monitored cell) is what it knew of the map at `tick`; `lost`: the UAVs that the team goes on without.
     """
 
     episode: int = f.integer(1, 2**31 - 1)
@@ -70,6 +70,7 @@ class Begin(Message):
     policy: int = f.integer(0, 2**62)
     last_visit: Array = f.array("<u2", 65_535)
     track: Array = f.array("<u2", 65_535)
+    lost: Array = f.array("<u2", 65_535)
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,25 @@ class Map(Message):
     sequence: int = f.integer(0, 2**62)
     last_visit: Array = f.array("<u2", 65_535)
     active: Array = f.array("<u2", 65_535)
+
+
+@dataclass(frozen=True)
+class Alive(Message):
+    """UAV `uav` is under way at `tick`; it waits for the position of UAV `peer`, or for none (-1)."""
+
+    uav: int = f.integer(0, 65_535)
+    life: int = f.integer(0, 2**63 - 1)
+    tick: int = f.integer(0, 65_535)
+    peer: int = f.integer(-1, 65_535)
+
+
+@dataclass(frozen=True)
+class Lost(Message):
+    """UAV `uav` is lost in this episode: its last record ends at `tick` (-1: it has none). Wait for it no more."""
+
+    episode: int = f.integer(1, 2**31 - 1)
+    uav: int = f.integer(0, 65_535)
+    tick: int = f.integer(-1, 65_535)
 
 
 @dataclass(frozen=True)
@@ -234,8 +254,8 @@ class Error(Message):
 
 
 MESSAGES: tuple[type[Message], ...] = (
-    Hello, Welcome, Begin, Record, Map, PolicyRequest, Policy, SampleRequest, Minibatch, PolicyPush, Ack, Beacon,
-    StatusRequest, Status, End, Bye, Error,
+    Hello, Welcome, Begin, Record, Map, Alive, Lost, PolicyRequest, Policy, SampleRequest, Minibatch, PolicyPush, Ack,
+    Beacon, StatusRequest, Status, End, Bye, Error,
 )  # fmt: skip
 
 EMPTY: NDArray[np.uint16] = np.zeros(0, "<u2")

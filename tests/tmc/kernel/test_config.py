@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import settings as quick
 from hypothesis import strategies as st
 
-from tmc.kernel.config import RANGES, SETTINGS, Config, ConfigError, build, check, flat, get
+from tmc.kernel.config import SETTINGS, Config, ConfigError, build, check, flat, get
+from tmc.kernel.limits import RANGES
 
 QUICK = quick(max_examples=50, deadline=None)
 

@@ -164,7 +164,9 @@ print(done, first)
     assert "is full: free some space and resume" in text
     assert not (tmp_path / "tmc.mcap").exists()
     log = Log(tmp_path / "tmc.mcap.active")
-    assert [e.message.tick for e in log.entries()] == list(range(int(done)))
+    ticks = [e.message.tick for e in log.entries()]
+    assert ticks == list(range(len(ticks)))
+    assert len(ticks) - int(done) in (0, 1)  # the disk may be full right after the last chunk, before its index
     assert log.cut and not log.finished
 
 

@@ -36,13 +36,15 @@ EXAMPLES: tuple[Message, ...] = (
     m.Welcome('{"team.size": 3}', "ab" * 32, "run-1", "/tmp/tracks", 4),
     m.Begin(
         episode=1, tick=1, shipped=-1, sequence=0, version=0, policy=1,
-        last_visit=numbers("<u2", 0, 1), track=numbers("<u2", 17, 18),
+        last_visit=numbers("<u2", 0, 1), track=numbers("<u2", 17, 18), lost=EMPTY,
     ),
     m.Record(
         2, 12345, 3, 1, 1, 2, 5, 4, numbers("<u2", 7, 8), numbers("u1", 3, 8), numbers("u1", 0, 1),
         numbers("<f4", 1.5, -20), numbers("<u2", 2), numbers("<u2", 9),
     ),
     m.Map(1, 10, 5, 4, 3, numbers("<u2", 0, 10, 3), EMPTY),
+    m.Alive(1, 12345, 40, -1),
+    m.Lost(2, 1, 30),
     m.PolicyRequest(4),
     m.Policy(4, b"\x08\x01onnx\x00"),
     m.SampleRequest(9),

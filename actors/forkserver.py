@@ -1,0 +1,156 @@
+"""`python -m actors.forkserver`: starts UAV processes by fork, so that they share the memory of what they all import.
+
+It imports the actor once, before any thread or ZeroMQ context exists, and forks a UAV for each order that comes in on
+stdin, a line of JSON: `{"start": NAME, "argv": [...], "log": PATH}`, or `{"signal": NUMBER, "name": NAME}`. On stdout
+it says, a line of JSON each, who started (`{"name": NAME, "pid": PID}`) and who ended
+(`{"name": NAME, "code": CODE}`, negative for a signal). UAVs die with it, and it dies with its supervisor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import ctypes
+import gc
+import importlib
+import json
+import os
+import select
+import signal
+import sys
+import traceback
+from pathlib import Path
+from typing import Any, NoReturn
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in actors.__main__: before NumPy is imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from actors import __main__ as actor
+from tmc.wire import process
+
+TITLE = ("python", "-P", "-m", "actors")
+"""What the command line of a UAV begins with, for `ps` and whoever else looks for it."""
+
+
+class ForkServer:
+    """Forks UAVs at the word of the supervisor, and reaps them."""
+
+    def __init__(self) -> None:
+        self._pids: dict[str, int] = {}
+        self._names: dict[int, str] = {}
+        self._ended, wake = os.pipe()
+        for end in (self._ended, wake):
+            os.set_blocking(end, False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+        self._ends = (self._ended, wake)
+
+    def serve(self) -> None:
+        """The main loop; ends when the supervisor closes its side."""
+        rest = b""
+        while True:
+            ready, _, _ = select.select([0, self._ended], [], [])
+            if self._ended in ready:
+                with contextlib.suppress(BlockingIOError):
+                    os.read(self._ended, 4096)
+                self._reap()
+            if 0 in ready:
+                data = os.read(0, 65_536)
+                if not data:
+                    return
+                *lines, rest = (rest + data).split(b"\n")
+                for line in lines:
+                    self._obey(json.loads(line))
+
+    def _obey(self, order: dict[str, Any]) -> None:
+        if "start" in order:
+            self._fork(order["start"], order["argv"], order["log"])
+        elif order["name"] in self._pids:  # not reaped, so the number is still its own
+            os.kill(self._pids[order["name"]], order["signal"])
+
+    def _fork(self, name: str, argv: list[str], log: str) -> None:
+        server = os.getpid()
+        pid = os.fork()
+        if pid == 0:
+            become(server, self._ends, argv, log)
+        self._pids[name], self._names[pid] = pid, name
+        _say({"name": name, "pid": pid})
+
+    def _reap(self) -> None:
+        while self._names:
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if pid == 0:
+                return
+            name = self._names.pop(pid)
+            del self._pids[name]
+            _say({"name": name, "code": os.waitstatus_to_exitcode(status)})
+
+
+def _say(report: dict[str, Any]) -> None:
+    data = json.dumps(report).encode() + b"\n"
+    while data:
+        data = data[os.write(1, data) :]
+
+
+def become(server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
+    """Turn the forked process into the UAV of `argv`, with nothing of the server's but its memory; never returns."""
+    code = process.FAILED
+    try:
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        os.setsid()  # Ctrl-C in the terminal is for the supervisor, who ends all in order
+        output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        for old, new in ((os.open(os.devnull, os.O_RDONLY), 0), (output, 1), (output, 2)):
+            os.dup2(old, new)
+        for end in (*ends, output):
+            os.close(end)
+        set_title((*TITLE, *argv))
+        process.die_with_parent(server)
+        code = actor.main(argv)
+    except SystemExit as left:  # argparse
+        code = left.code if isinstance(left.code, int) else process.FAILED
+    except BaseException:  # the traceback belongs into the log, and nothing may get back into the server's loop
+        traceback.print_exc()
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(Exception):
+                stream.flush()
+        os._exit(code)
+
+
+def set_title(words: tuple[str, ...]) -> None:
+    """Overwrite the command line that `ps` shows, as far as there is room in the one that the server got; Linux only.
+
+    The kernel shows the memory from `arg_start` to `arg_end` of /proc/self/stat (proc(5), fields 48 and 49).
+    """
+    if sys.platform != "linux":
+        return
+    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    start, end = int(fields[45]), int(fields[46])
+    text = b"\0".join(word.encode() for word in words)[: max(end - start - 1, 0)]
+    if start and text:
+        ctypes.memset(start, 0, end - start)
+        ctypes.memmove(start, text, len(text))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Import, freeze, serve."""
+    parser = argparse.ArgumentParser("actors.forkserver", description=__doc__)
+    parser.add_argument("--preload", action="append", default=[], metavar="MODULE", help="what all UAVs will need")
+    parser.add_argument("--out", default="", help="the run's folder, to be found by")
+    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    parser.add_argument("--room", default="", help="space for the command lines of the UAVs")
+    a = parser.parse_args(argv)
+    process.die_with_parent(a.parent)
+    set_title((*TITLE[:-1], "actors.forkserver", "--out", a.out, "--parent", str(a.parent)))
+    for module in a.preload:
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()  # what is here now is never collected, so a collection in a UAV does not copy its pages
+    with contextlib.suppress(BrokenPipeError):
+        ForkServer().serve()
+    return process.DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,60 @@
+"""A line of a bench's result, and the machine that it was measured on."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure: `ratio` is value / reference, or the median of such ratios taken in pairs; None where there is none.
+
+    `what` says in words what the reference is.
+    """
+
+    bench: str
+    case: str
+    value: float | None
+    unit: str
+    reference: float | None = None
+    ratio: float | None = None
+    what: str = ""
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores, load and versions: what a figure means nothing without."""
+    return {
+        "platform": platform.platform(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2),
+        "python": platform.python_version(),
+        **{name: _version(name) for name in ("overfly", "numpy", "pyzmq", "onnxruntime")},
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def text(rows: list[Row]) -> str:
+    """The table for a person."""
+    lines = [f"{'case':<34} {'value':>12} {'unit':<22} {'reference':>12} {'ratio':>6}"]
+    lines += [
+        f"{r.case:<34} {_number(r.value):>12} {r.unit:<22} {_number(r.reference):>12} "
+        f"{'' if r.ratio is None else f'{r.ratio:.2f}':>6} {r.what}".rstrip()
+        for r in rows
+    ]
+    return "\n".join(lines)
+
+
+def _number(x: float | None) -> str:
+    if x is None:
+        return "-"
+    return f"{x:,.0f}" if abs(x) >= 1000 else f"{x:.4g}"

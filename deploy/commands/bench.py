@@ -1,0 +1,47 @@
+"""`overfly bench NAME`: measure this machine; each figure beside its reference of the same run."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+from dataclasses import asdict, dataclass
+
+from deploy.benches.row import machine, text
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One row: its name, the module with `add_arguments(parser)` and `measure(args) -> list[Row]`, one line of help."""
+
+    name: str
+    module: str
+    about: str
+
+
+BENCHES: tuple[Bench, ...] = (
+    Bench("rollout", "deploy.benches.rollout", "UAV steps a second of N processes against the fleet in one process"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    names = parser.add_subparsers(dest="bench", required=True, metavar="NAME")
+    for bench in BENCHES:
+        sub = names.add_parser(bench.name, help=bench.about, description=bench.about)
+        sub.add_argument("--json", action="store_true", help="print one line of JSON a figure")
+        importlib.import_module(bench.module).add_arguments(sub)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Measure, then print the table, or a line of JSON a figure with the machine and the versions."""
+    facts = machine()
+    rows = importlib.import_module(next(b.module for b in BENCHES if b.name == args.bench)).measure(args)
+    if args.json:
+        for row in rows:
+            print(json.dumps(asdict(row) | facts))
+        return 0
+    print(text(rows))
+    print("\n" + " · ".join(f"{key} {value}" for key, value in facts.items()), file=sys.stderr)
+    return 0

@@ -1,0 +1,46 @@
+"""The learner's side of the TMC: its requests for minibatches, answered as far as the limiter allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from tmc.limiter import Limiter
+from tmc.replay import Replay
+from tmc.wire.messages import Hello, Minibatch
+
+WINDOW = 8
+"""Most requests that may be in flight."""
+
+
+class Feed:
+    """Requests in the order of their arrival. `life`: the learner's process, -1 before there is one."""
+
+    def __init__(self, replay: Replay, limiter: Limiter, batch: int) -> None:
+        self.replay, self.limiter, self.batch = replay, limiter, batch
+        self.life = -1
+        self.told_the_end = False
+        self._requests: list[int] = []
+
+    def welcome(self, hello: Hello) -> None:
+        """A learner is here, perhaps back from an older checkpoint: what it lost since is owed to it again."""
+        self._requests.clear()  # it asks again once it is welcome
+        if hello.life != self.life:
+            self.life, self.told_the_end = hello.life, False
+            self.limiter.updates = min(self.limiter.updates, hello.updates)
+
+    def ask(self, request: int) -> bool:
+        """Take a request; False when too many are in flight already."""
+        if len(self._requests) >= WINDOW:
+            return False
+        self._requests.append(request)
+        return True
+
+    def serve(self, episodes: int, ticks: int) -> Iterator[Minibatch]:
+        """A minibatch for each request for which one is owed."""
+        while self._requests and self.limiter.owed:
+            s = self.replay.sample(self.limiter.updates, self.batch)
+            self.limiter.sample()
+            yield Minibatch(
+                self._requests.pop(0), episodes, ticks, s.observation, s.action, s.reward,
+                s.next_observation, s.discount, s.allowed,
+            )  # fmt: skip

@@ -1,0 +1,78 @@
+"""The limits of the settings: the range of each number, and what does not go together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from operator import attrgetter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tmc.kernel.config import Config
+
+# (key, lowest, highest): ranges that hold whatever the rest says.
+RANGES: tuple[tuple[str, float, float], ...] = (
+    ("scenario", 1, 2),
+    ("world.alpha", 1e-9, 10.0),
+    ("world.alpha_offroad", 0.0, 10.0),
+    ("team.size", 1, 1000),
+    ("team.sensing_range", 0.0, 1000.0),
+    ("comms.period", 1, 60_000),
+    ("comms.patience", 0.1, 1e6),
+    ("comms.lost_after", 1.0, 1e6),
+    ("reward.collision", -1e6, 1e6),
+    ("reward.new_cell", -1e6, 1e6),
+    ("reward.weight", -1e6, 1e6),
+    ("exploration.start", 0.0, 1.0),
+    ("exploration.end", 0.0, 1.0),
+    ("exploration.fraction", 0.0, 1.0),
+    ("observation.radius", 1, 100),
+    ("observation.near", 0, 100),
+    ("network.kernel", 1, 64),
+    ("network.stride", 1, 64),
+    ("network.dense", 1, 65_536),
+    ("dqn.learning_rate", 1e-12, 10.0),
+    ("dqn.batch", 1, 65_536),
+    ("dqn.gamma", 0.0, 1.0),
+    ("dqn.n_step", 1, 1000),
+    ("dqn.reward_scale", 1e-9, 1e9),
+    ("dqn.target_episodes", 0, 1_000_000),
+    ("dqn.target_updates", 0, 1_000_000_000),
+    ("replay.capacity", 1, 1_000_000_000),
+    ("replay.learn_start", 1, 1_000_000_000),
+    ("replay.updates_per_tick", 0.0, 1000.0),
+    ("replay.slack", 1, 1_000_000),
+    ("training.episodes", 1, 10_000_000),
+    ("training.ticks", 1, 60_000),
+    ("training.seed", 0, 2**63 - 1),
+    ("training.push_every", 1, 1_000_000_000),
+    ("training.checkpoint_every", 1, 1_000_000_000),
+    ("training.threads", 1, 1024),
+    ("journal.flush", 0.01, 60.0),
+    ("journal.chunk", 1024, 64 * 1024 * 1024),
+    ("trial.stall", 0.0, 60.0),
+    ("trial.stall_share", 0.0, 1.0),
+    ("trial.stall_spread", 0.0, 1.0),
+    ("trial.stall_uav", -1, 65_535),
+)
+
+
+def broken(config: Config) -> str | None:
+    """What is impossible about these settings: the reason and the mend, in one sentence; None when nothing is."""
+    return next(_complaints(config), None)
+
+
+def _complaints(config: Config) -> Iterator[str]:
+    for key, low, high in RANGES:
+        value = attrgetter(key)(config)
+        if not low <= value <= high:
+            yield f"{key} = {value} is out of range: choose {low:g} to {high:g}"
+    if not config.network.channels or any(not 1 <= c <= 4096 for c in config.network.channels):
+        yield "network.channels must list 1 to 4096 filters for at least one convolution"
+    if config.replay.learn_start > config.replay.capacity:
+        yield "replay.learn_start is larger than replay.capacity, so learning would never start"
+    if config.dqn.target_episodes == 0 and config.dqn.target_updates == 0:
+        yield "dqn.target_episodes and dqn.target_updates are both 0, so the target would never follow"
+    if config.observation.view == "ego" and config.observation.near > config.observation.radius:
+        yield "observation.near is larger than observation.radius"
+    if config.observation.view == "whole" and config.observation.near:
+        yield "observation.near needs observation.view = ego"
