@@ -40,7 +40,7 @@ class StallingTracks:
         self._tracks.begin(episode, starts)
 
     def publish(self, tick: int, cell: int) -> None:
-        if tick > self.newest(self._uav)[0]:  # a process that was started again only repeats itself until then
+        if self.at(self._uav, tick) < 0:  # otherwise a process that was started again repeats itself
             seconds = stall(self._config, self._episode, tick, self._uav)
             if seconds > 0:
                 self._sleep(seconds)

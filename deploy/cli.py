@@ -27,6 +27,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("run", "deploy.commands.run", "train: spawn TMC, learner and N UAVs, and look after them"),
     Command("fly", "deploy.commands.fly", "fly a mission with a fixed policy or a planner, no learner"),
     Command("evaluate", "deploy.commands.evaluate", "compare policies and planners over many seeds"),
+    Command("verify", "deploy.commands.verify", "put to the test: exactness, asynchrony"),
     Command("bench", "deploy.commands.bench", "measure this machine: rollout"),
     Command("analyze", "deploy.commands.analyze", "a run's summary and pictures, from its log"),
     Command("log", "deploy.commands.log", "read the log of a run: info, cat, moves, uncertainty, events, digest"),

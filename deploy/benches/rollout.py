@@ -110,8 +110,8 @@ def _rows(config: Config, transport: str, flown: list[Flown], fleet: list[float]
     yield Row("rollout", f"{case} waits", median(waits) if waits else None, "share of time")
     yield Row("rollout", f"{case} beacons", median(f.beacons for f in flown), "beacons/step")
     figures: dict[str, tuple[float | None, str]] = {
-        "private": (memory and memory.private, "MiB, largest UAV"),
-        "memory": (memory and memory.total, "MiB in all"),
+        "private": (memory.private if memory else None, "MiB, largest UAV"),
+        "memory": (memory.total if memory else None, "MiB in all"),
         "start": (median(f.start for f in flown), "s to the first tick"),
     }
     for name, (value, unit) in figures.items():

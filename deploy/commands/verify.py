@@ -1,0 +1,188 @@
+"""`overfly verify`: that processes fly what one process flies, and that they do so without waiting for each other."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from deploy import asynchrony, exactness, settings, who
+from deploy.mission import check, new_folder
+from deploy.progress import PLAIN_EVERY, clock
+from tmc.kernel.config import Config, ConfigError
+from tmc.wire import process
+
+PHASES = ("together", "staggered")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="WHAT")
+    about = "fly missions as processes and in lock step, and compare every fact of their logs"
+    exact = kinds.add_parser("exactness", help=about, description=about)
+    exact.add_argument("--actors", dest="teams", default="1,2,3,10", metavar="N[,N...]", help="default: %(default)s")
+    exact.add_argument("--scenarios", default="1,2", metavar="S[,S]", help="default: %(default)s")
+    exact.add_argument("--tu", dest="periods", default="1,5,10,20", metavar="T[,T...]", help="default: %(default)s")
+    exact.add_argument("--phases", default=",".join(PHASES), metavar="P[,P]", help="default: %(default)s")
+    exact.add_argument("--seeds", type=int, default=1, metavar="S", help="missions of each kind (default: 1)")
+    exact.add_argument("--stalls", action="store_true", help="stall the UAVs at random ticks for some milliseconds")
+    exact.add_argument("--ticks", metavar="T", help="training.ticks")
+    exact.add_argument("--map", metavar="NAME", help="world.map")
+    _add_common(exact)
+    about = "hold one UAV back, and see how far the others run ahead of it, and what bounds them"
+    asynchronous = kinds.add_parser("asynchrony", help=about, description=about)
+    asynchronous.add_argument("--actors", type=int, default=3, metavar="N", help="default: %(default)s")
+    asynchronous.add_argument("--hold", type=float, default=0.1, metavar="S", help="seconds a tick (default: 0.1)")
+    _add_common(asynchronous)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--who", default="planner:greedy", help="who flies: policy file, run folder, or a planner")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="any setting")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the logs of missions that differ")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON a row")
+
+
+def main(args: argparse.Namespace) -> int:
+    """Verify; exit code 1 when something is not as it should be."""
+    try:
+        return _exactness(args) if args.kind == "exactness" else _asynchrony(args)
+    except exactness.Stopped as stopped:
+        print(f"overfly: {stopped}", file=sys.stderr)
+        return process.FAILED
+
+
+class Line:
+    """Progress on stderr: one line that is written over on a terminal, a line now and then elsewhere."""
+
+    def __init__(self) -> None:
+        self._tty, self._next = sys.stderr.isatty(), 0.0
+
+    def write(self, text: str) -> None:
+        if self._tty:
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+        elif time.monotonic() >= self._next:
+            self._next = time.monotonic() + PLAIN_EVERY
+            print(text, file=sys.stderr, flush=True)
+
+    def clear(self) -> None:
+        """Make room for a line that stays."""
+        if self._tty:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _workplace(out: Path | None) -> Iterator[Path]:
+    """A folder for logs: `out`, or a temporary one. It is removed unless something was left in it."""
+    folder = Path(tempfile.mkdtemp(prefix="overfly-verify-")) if out is None else new_folder(out, "verify")
+    try:
+        yield folder
+    finally:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def listed(option: str, text: str, choices: tuple[str, ...] = ()) -> list[str]:
+    """The items of `1,3,10`; ConfigError for one that is no number, or none of the choices."""
+    items = [item.strip() for item in text.split(",")]
+    for item in items:
+        if not (item in choices if choices else item.isdecimal()):
+            known = ", ".join(choices) if choices else "numbers"
+            raise ConfigError(f"{option} {text}: '{item}' cannot be; list {known}, with commas between them")
+    return items
+
+
+# Exactness.
+
+
+def _exactness(args: argparse.Namespace) -> int:
+    configs, policy = _configs(args)
+    if not args.json:
+        print(HEAD, flush=True)
+    line, start, steps, facts = Line(), time.monotonic(), 0, 0
+    with _workplace(args.out) as place:
+        for number, config, share in exactness.timed(configs):
+            spent = time.monotonic() - start
+            left = f" · {clock(spent / share * (1 - share))} left" if share else ""
+            line.write(f"mission {number} of {len(configs)}{left}")
+            outcome = exactness.verify(config, policy, place / _name(config))
+            steps, facts = steps + outcome.steps, facts + outcome.facts
+            line.clear()
+            _print_row(config, outcome, as_json=args.json)
+            if outcome.difference is not None:
+                print(f"overfly: different: {outcome.difference} (processes against lock step); the logs are in "
+                      f"{place / _name(config)}", file=sys.stderr)  # fmt: skip
+                return process.FAILED
+    if not args.json:
+        spent = time.monotonic() - start
+        print(f"\n{len(configs)} missions, {steps:,} steps, {facts:,} facts in {clock(spent)}: no difference")
+    return process.DONE
+
+
+def _configs(args: argparse.Namespace) -> tuple[list[Config], bytes | None]:
+    """Every mission to fly, checked before the first one flies, and the policy that flies it."""
+    if args.seeds < 1:
+        raise ConfigError("--seeds must be 1 or more")
+    pilot = who.resolve(args.who)
+    base = {**pilot.values, "training.episodes": 1, **who.FIXED, **(exactness.STALLS if args.stalls else {})}
+    teams, scenarios, periods = (
+        [int(item) for item in listed(option, text)]
+        for option, text in (("--actors", args.teams), ("--scenarios", args.scenarios), ("--tu", args.periods))
+    )
+    base |= settings.chosen(args)
+    phases = listed("--phases", args.phases, PHASES)
+    configs = exactness.combinations(base, teams, scenarios, periods, phases, args.seeds)
+    for config in configs:
+        check(config, pilot.policy)
+    return configs, pilot.policy
+
+
+HEAD = f"{'N':>3} {'scenario':>8} {'T_u':>4} {'phase':<9} {'seed':>5} {'steps':>7} {'facts':>9} {'seconds':>8}  result"
+
+
+def _print_row(config: Config, outcome: exactness.Outcome, *, as_json: bool) -> None:
+    row: dict[str, Any] = {
+        "actors": config.team.size, "scenario": config.scenario, "tu": config.T_u, "phase": config.comms.phase,
+        "seed": config.training.seed, "steps": outcome.steps, "facts": outcome.facts,
+        "seconds": round(outcome.seconds, 1),
+    }  # fmt: skip
+    if as_json:
+        print(json.dumps(row | {"difference": outcome.difference and asdict(outcome.difference)}), flush=True)
+        return
+    n, scenario, period, phase, seed, steps, facts, seconds = row.values()
+    result = "no difference" if outcome.difference is None else "DIFFERENT"
+    print(f"{n:>3} {scenario:>8} {period:>4} {phase:<9} {seed:>5} {steps:>7,} {facts:>9,} {seconds:>8.1f}  {result}",
+          flush=True)  # fmt: skip
+
+
+def _name(config: Config) -> str:
+    comms = f"tu{config.T_u}-{config.comms.phase}"
+    return f"n{config.team.size}-scenario{config.scenario}-{comms}-seed{config.training.seed}"
+
+
+# Asynchrony.
+
+
+def _asynchrony(args: argparse.Namespace) -> int:
+    if args.actors < 2 or args.hold <= 0:
+        raise ConfigError("--actors must be 2 or more, and --hold more than 0: somebody has to be ahead of somebody")
+    pilot = who.resolve(args.who)
+    base = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+    if not args.json:
+        print(f"{args.actors} UAVs, one of them held back by {args.hold * 1000:g} ms a tick\n\n{asynchrony.HEAD}")
+    line, good = Line(), True
+    with _workplace(args.out) as place:
+        for number, trial in enumerate(asynchrony.TRIALS, 1):
+            line.write(f"flight {number} of {len(asynchrony.TRIALS)}")
+            result = asynchrony.fly(trial, args.actors, args.hold, base, pilot.policy, place / f"flight-{number}")
+            line.clear()
+            print(json.dumps(asdict(result)) if args.json else result.row(), flush=True)
+            good &= result.good
+    return process.DONE if good else process.FAILED

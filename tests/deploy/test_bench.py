@@ -1,0 +1,51 @@
+"""`overfly bench`: a table of benches, each figure beside its reference, as text or as lines of JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+from deploy import cli
+from deploy.benches import rollout
+from deploy.benches.row import Row, text
+
+TINY = ("bench", "rollout", "--actors", "1,2", "--ticks", "50", "--repeats", "1")
+
+
+def test_rollout_prints_a_line_of_json_a_figure(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*TINY, "--transport", "both", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    cases = {row["case"]: row for row in rows}
+    for n in (1, 2):
+        assert cases[f"N={n} one process"]["value"] > 0
+        for transport in ("table", "beacons"):
+            rate = cases[f"N={n} {transport}"]
+            assert rate["value"] > 0 and rate["unit"] == "UAV steps/s"
+            assert rate["ratio"] == pytest.approx(rate["value"] / rate["reference"])
+            assert 0 < cases[f"N={n} {transport} start"]["value"] < 60
+    assert cases["N=2 table beacons"]["value"] == 0
+    assert cases["N=2 beacons beacons"]["value"] > 0
+    for row in rows:
+        assert {"bench", "case", "value", "unit", "reference", "ratio", "platform", "cores", "load", "numpy"} <= set(
+            row
+        )
+
+
+def test_memory_is_what_the_system_says() -> None:
+    memory = rollout.weigh_all({"uav-000": os.getpid()})
+    assert memory is not None and 1 < memory.private < 4096 and memory.total > 0
+    assert rollout.weigh_all({"uav-000": 2**22 + 1}) is None
+
+
+def test_the_table_has_a_dash_where_nothing_was_measured() -> None:
+    table = text(
+        [Row("rollout", "N=1 table waits", None, "share of time"), Row("rollout", "N=1", 4321.0, "UAV steps/s")]
+    )
+    assert " - share of time" in table and "4,321 UAV steps/s" in table
+
+
+def test_a_mistake_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*TINY[:-1], "0"]) == 2
+    assert "--repeats" in capsys.readouterr().err

@@ -1,0 +1,180 @@
+"""The supervisor: who is started again, after how long, who is given up, and that nothing is left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from deploy import supervisor as supervisors
+from deploy.forked import Forked, ForkServer
+from deploy.plan import Child, Plan
+from deploy.supervisor import MissionFailed, Supervisor
+from tmc.wire import process
+
+ROOT = Path(__file__).parents[2]
+
+
+def python(name: str, code: str, *, restart: bool = True, leads: bool = False) -> Child:
+    """A process of the plan that runs `code`."""
+    return Child(name, (sys.executable, "-P", "-c", code), restart=restart, leads=leads)
+
+
+def uav(number: int, out: Path) -> Child:
+    """A forked UAV that says hello to nobody, for ever."""
+    command = ("--id", str(number), "--connect", f"ipc://{out}/nobody", "--out", str(out))
+    return Child(f"uav-{number:03d}", command, restart=True, forked=True)
+
+
+@pytest.fixture
+def supervise(tmp_path: Path) -> Iterator[Callable[..., Supervisor]]:
+    """A started supervisor of these children; its notes are in `.notes`."""
+    made: list[Supervisor] = []
+
+    def start(*children: Child) -> Supervisor:
+        notes: list[str] = []
+        scratch = tmp_path / "scratch"
+        scratch.mkdir(exist_ok=True)
+        plan = Plan(tuple(children), "", scratch / "tracks", scratch)
+        made.append(Supervisor(plan, tmp_path, 1, notes.append))
+        made[-1].notes = notes  # type: ignore[attr-defined]
+        made[-1].start()
+        return made[-1]
+
+    yield start
+    for supervisor in made:
+        supervisor.stop()
+        supervisor.close()
+
+
+def watch_until(supervisor: Supervisor, done: Callable[[], bool], patience: float = 20.0) -> None:
+    until = time.monotonic() + patience
+    while not done():
+        assert time.monotonic() < until, "it did not happen"
+        supervisor.watch()
+        time.sleep(0.01)
+
+
+def alive(pid: int) -> bool:
+    """True for a process that runs; a zombie does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_a_process_that_fails_is_started_again_with_back_off_and_then_given_up(supervise, monkeypatch) -> None:
+    monkeypatch.setattr(supervisors, "TRIES", 4)
+    supervisor = supervise(python("learner", "import sys; sys.exit(1)"))
+    begin = time.monotonic()
+    with pytest.raises(MissionFailed, match="learner ended with exit code 1"):
+        watch_until(supervisor, lambda: False)
+    assert supervisor.restarts() == {"learner": 3}
+    assert time.monotonic() - begin > 0.1 + 0.2 + 0.4
+
+
+@pytest.mark.parametrize("code", sorted(supervisors.FINAL))
+def test_a_mistake_is_not_tried_again(supervise, code: int) -> None:
+    text = f"import sys; print('overfly: what was wrong', file=sys.stderr); sys.exit({code})"
+    supervisor = supervise(python("learner", text))
+    with pytest.raises(MissionFailed, match="what was wrong; its output is in"):
+        watch_until(supervisor, lambda: False)
+    assert supervisor.restarts() == {}
+
+
+def test_the_mission_ends_with_its_leader(supervise) -> None:
+    supervisor = supervise(python("tmc", "", restart=False, leads=True))
+    until = time.monotonic() + 10
+    while not supervisor.watch():
+        assert time.monotonic() < until
+    assert supervisor.exit_codes() == {"tmc": 0}
+
+
+def test_kills_from_outside_do_not_count(supervise, tmp_path: Path) -> None:
+    supervisor = supervise(uav(0, tmp_path))
+    seen: set[int] = set()
+    for _ in range(supervisors.TRIES + 4):
+        watch_until(supervisor, lambda: supervisor.pids().get("uav-000", -1) not in {*seen, -1})
+        pid = supervisor.pids()["uav-000"]
+        seen.add(pid)
+        os.kill(pid, signal.SIGKILL)
+        watch_until(supervisor, lambda pid=pid: not alive(pid))
+    watch_until(supervisor, lambda: supervisor.restarts() == {"uav-000": supervisors.TRIES + 4})
+    assert any("uav-000 was killed by SIGKILL; it is started again" in note for note in supervisor.notes)
+
+
+def test_a_forked_uav_fails_like_any_other(supervise, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(supervisors, "TRIES", 2)
+    wrong = Child("uav-000", ("--id", "0", "--connect", "nowhere", "--out", str(tmp_path)), restart=True, forked=True)
+    supervisor = supervise(wrong)
+    with pytest.raises(MissionFailed, match=r"uav-000 ended with exit code 2: .*nowhere"):
+        watch_until(supervisor, lambda: False)
+    assert supervisor.exit_codes() == {"uav-000": process.USAGE}
+
+
+def test_a_forked_uav_has_its_own_title_session_and_output(supervise, tmp_path: Path) -> None:
+    supervisor = supervise(uav(0, tmp_path), uav(1, tmp_path))
+    watch_until(supervisor, lambda: {"uav-000", "uav-001"} <= set(supervisor.pids()))
+    pids = supervisor.pids()
+
+    def line() -> str:
+        return Path(f"/proc/{pids['uav-001']}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+
+    watch_until(supervisor, lambda: f"actors --id 1 --connect ipc://{tmp_path}" in line())
+    assert f"--out {tmp_path}" in line()
+    assert os.getsid(pids["uav-001"]) == pids["uav-001"]
+    assert Path(f"/proc/{pids['uav-001']}/fd/2").readlink() == tmp_path / "logs" / "uav-001.txt"
+    supervisor.stop()
+    assert set(supervisor.exit_codes().values()) <= {process.STOPPED, -signal.SIGTERM}  # before it could note it
+    supervisor.close()
+    assert not [pid for pid in pids.values() if alive(pid)]
+
+
+def test_a_lost_forkserver_is_replaced_and_its_uavs_come_back(supervise, tmp_path: Path) -> None:
+    supervisor = supervise(uav(0, tmp_path))
+    watch_until(supervisor, lambda: "uav-000" in supervisor.pids())
+    before = supervisor.pids()
+    os.kill(before["forkserver"], signal.SIGKILL)
+    watch_until(supervisor, lambda: not alive(before["uav-000"]))
+    watch_until(supervisor, lambda: supervisor.pids().get("uav-000", before["uav-000"]) != before["uav-000"])
+    assert supervisor.restarts() == {"uav-000": 1}
+
+
+def test_a_forkserver_that_cannot_start_is_a_failure_not_a_kill(tmp_path: Path) -> None:
+    server = ForkServer((sys.executable, "-c", "raise SystemExit(3)"), dict(os.environ), tmp_path / "forkserver.txt")
+    child = server.start("uav-000", ["--id", "0"], tmp_path / "uav-000.txt")
+    assert isinstance(child, Forked) and child.wait(10.0) == process.FAILED
+    server.close()
+
+
+def test_everybody_dies_with_a_supervisor_that_is_killed(tmp_path: Path) -> None:
+    code = f"""
+import sys, time
+from pathlib import Path
+sys.path.insert(0, {str(ROOT)!r})
+from deploy.plan import Child, Plan
+from deploy.supervisor import Supervisor
+out = Path({str(tmp_path)!r})
+child = Child("uav-000", ("--id", "0", "--connect", f"ipc://{{out}}/nobody", "--out", str(out)), True, forked=True)
+supervisor = Supervisor(Plan((child,), "", out / "tracks", out / "scratch"), out, 1, print)
+supervisor.start()
+while "uav-000" not in supervisor.pids():
+    time.sleep(0.01)
+print(*supervisor.pids().values(), flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-P", "-c", code], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        pids = [int(pid) for pid in run.stdout.readline().split()]
+        assert len(pids) == 2 and all(alive(pid) for pid in pids)
+        run.kill()
+    until = time.monotonic() + 10
+    while any(alive(pid) for pid in pids):
+        assert time.monotonic() < until, "a process outlived its supervisor"
+        time.sleep(0.02)
