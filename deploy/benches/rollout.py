@@ -168,12 +168,14 @@ def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool,
 
 
 def weigh_all(pids: Mapping[str, int]) -> Memory | None:
-    """The memory of these processes and of this one; None where the system does not tell, or a process is gone."""
+    """The memory of these processes and of this one; None where the system does not tell, or they are gone."""
     try:
         rolls = {name: _rollup(pid) for name, pid in {**pids, "supervisor": os.getpid()}.items()}
     except OSError:
         return None
     uavs = [roll for name, roll in rolls.items() if name.startswith("uav-")]
+    if not uavs:
+        return None
     private = max(roll["Private_Clean"] + roll["Private_Dirty"] for roll in uavs)
     return Memory(private / 1024, sum(roll["Pss"] for roll in rolls.values()) / 1024)
 
