@@ -32,7 +32,7 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
         service.say(messages.Bye("uav", uav, str(left)))
         if left.code not in {process.DONE, process.STOPPED}:
             print(f"overfly: UAV {uav}: {left}", file=sys.stderr)
-        return left.code
+        return stop.code if left.code == process.STOPPED else left.code
     finally:
         service.close()
 

@@ -6,6 +6,7 @@ import argparse
 import importlib
 import importlib.util
 import os
+import signal
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -75,6 +76,8 @@ def check_install() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    # While modules are imported nothing is worth an orderly end: Ctrl-C ends the process, without a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     argv = sys.argv[1:] if argv is None else argv
     chosen = next((a for a in argv if not a.startswith("-")), None)
     args = parser_for(chosen).parse_args(argv)
@@ -82,6 +85,7 @@ def main(argv: list[str] | None = None) -> int:
 
     def run() -> int:
         check_install()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         return int(module.main(args))
 
     try:
@@ -91,6 +95,9 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a full disk, a folder that was removed
+        print(f"overfly: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
+        return process.FAILED
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from actors.planners import PLANNERS, PREFIX
 from actors.tracks import create_table
 from deploy import lockstep, plan, who
 from deploy.progress import Observer, Progress
@@ -36,9 +37,9 @@ def new_folder(out: Path | None, name: str) -> Path:
             if not out.exists():
                 break
             out = Path("runs") / f"{name}-{stamp}-{n}"
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out} exists and is not empty: choose another --out, or remove it")
     try:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise ConfigError(f"{out} exists and is not empty: choose another --out, or remove it")
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"cannot make the run folder {out}: {error.strerror}; choose another --out") from None
@@ -55,6 +56,9 @@ def bound_of(world: World) -> float:
 
 def check(config: Config, policy: bytes | None = None) -> World:
     """The world of a mission, once everything that can be wrong with its settings has been looked at."""
+    if config.team.pilot != "policy" and config.team.pilot.removeprefix(PREFIX) not in PLANNERS:
+        known = ", ".join(PREFIX + name for name in PLANNERS)
+        raise ConfigError(f"team.pilot = {config.team.pilot} is neither policy nor {known}")
     world = World(config)
     if policy is not None:
         who.require_policy(policy, world)
@@ -84,7 +88,8 @@ class Mission:
 
     def run(self, *, in_one_process: bool) -> int:
         """Fly it; returns the exit code. What it left is in the run folder either way."""
-        signal.signal(signal.SIGTERM, _interrupt)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, _interrupt)
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
@@ -130,7 +135,10 @@ class Mission:
             "started": datetime.fromtimestamp(self._start, UTC).isoformat(timespec="seconds"),
             "seconds": round(time.time() - self._start, 1),
         }
-        (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
+        try:
+            (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
+        except OSError as error:
+            self.progress.note(f"cannot write {self.out / 'run.json'}: {error.strerror}")
 
 
 def _interrupt(number: int, _frame: FrameType | None) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
-from tmc.kernel.config import Config, ConfigError
+from tmc.kernel.config import Config, ConfigError, build, flat
 from tmc.kernel.policy import PolicyCard, PolicyError, require
 from tmc.kernel.world import World
 
@@ -42,7 +42,10 @@ def _of_run(folder: Path) -> Who:
     config, policy = folder / "config.json", folder / "policies" / "final.onnx"
     if not config.is_file():
         raise ConfigError(f"{folder} is no run folder: it has no config.json")
-    values = json.loads(config.read_text())
+    try:
+        values = dict(flat(build(json.loads(config.read_text()))))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(f"{config} cannot be read: {error}") from None
     if values.get("team.pilot", "policy") != "policy":
         return Who(str(folder), None, values)
     if not policy.is_file():
@@ -71,6 +74,11 @@ def view_of(card: PolicyCard) -> dict[str, Any]:
         "observation.near": card.near,
         "exploration.mask_blocked": card.mask_blocked,
     }
+
+
+def pilot_of(who: Who) -> dict[str, Any]:
+    """The one setting that WHO decides, whatever else is set."""
+    return {"team.pilot": who.values["team.pilot"]}
 
 
 FIXED = {"exploration.start": 0.0, "exploration.end": 0.0}

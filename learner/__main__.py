@@ -25,7 +25,7 @@ def learn(endpoint: str, out: Path) -> int:
     stop = process.Stop()
     service = Service(endpoint, out)
     try:
-        return process.DONE if service.learn(stop) else process.STOPPED
+        return process.DONE if service.learn(stop) else stop.code
     finally:
         service.close()
 

@@ -20,6 +20,7 @@ from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 from tmc.wire import sockets
 from tmc.wire.codec import CodecError
+from tmc.wire.sockets import EndpointError
 
 WINDOW = 2
 """Minibatch requests in flight, so that the learner never waits for the way there and back."""
@@ -69,10 +70,15 @@ class Service:
                 message = self._receive()
                 if isinstance(message, m.Welcome):
                     return message
+                if isinstance(message, m.Error):
+                    raise EndpointError(f"the TMC refused: {message.text}")
+                if isinstance(message, m.End):
+                    return None
         return None
 
     def _prepare(self, welcome: m.Welcome) -> None:
         config = build(json.loads(welcome.config))
+        self._own(welcome.run)
         self.config = config
         self.trainer = start(config, World(config).grid)
         self.out.mkdir(parents=True, exist_ok=True)
@@ -84,6 +90,14 @@ class Service:
         self.trainer.version = max(self.trainer.version, welcome.policy)
         self._start = self._told = time.monotonic()
         self._told_updates = self.trainer.updates
+
+    def _own(self, run: str) -> None:
+        """Refuse a folder with the checkpoints of another mission: the learner would go on from them."""
+        mark = self.out / "learner.run"
+        if mark.exists() and mark.read_text().strip() != run:
+            raise EndpointError(f"{self.out} holds what was learned in another mission: choose another --out")
+        self.out.mkdir(parents=True, exist_ok=True)
+        mark.write_text(run + "\n")
 
     def _listen(self) -> list[m.Message]:
         """What has come in; the time spent waiting for it is the learner's idle time."""

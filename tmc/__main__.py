@@ -31,7 +31,7 @@ def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, trac
     out.mkdir(parents=True, exist_ok=True)
     service = Service(station, Journal(out, world, run), endpoint)
     try:
-        return process.DONE if service.serve(stop) else process.STOPPED
+        return process.DONE if service.serve(stop) else stop.code
     finally:
         service.close()
 

@@ -13,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from statistics import mean, stdev
+from typing import Any
 
 from deploy import lockstep, settings, who
 from deploy.mission import bound_of, check
@@ -22,6 +23,8 @@ from tmc.roster import Outbox
 
 FIRST_SEED = 1_000_000
 """Seeds of an evaluation start here, far from those that people train with."""
+WORLD = ("scenario", "team.size", "team.sensing_range", "comms.period", "comms.phase", "training.ticks")
+"""What a run brings along for everybody that it is compared with, beside `world.*`."""
 T_975 = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131,
     2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
@@ -73,11 +76,14 @@ def main(args: argparse.Namespace) -> int:
     """Fly them all, then print the table."""
     if args.seeds < 1 or args.jobs < 1:
         raise ConfigError("--seeds and --jobs must be 1 or more")
+    if args.seed is not None or args.episodes is not None:
+        raise ConfigError("evaluate flies one episode a seed: choose them with --seeds and --first-seed")
     work = list(missions(args))
     rows = table(fly_all(work, args.jobs))
     if args.json:
         for row in rows:
-            print(json.dumps(asdict(row)))
+            values = asdict(row).items()  # nan is no JSON
+            print(json.dumps({k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values}))
     else:
         print(text(rows, work[0][1]))
     return 0
@@ -93,15 +99,28 @@ def team_sizes(listed: str | None) -> list[int | None]:
 
 def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | None]]:
     """(WHO, config, policy) of every mission, checked before the first one flies."""
-    for name in args.who:
-        pilot = who.resolve(name)
+    pilots = [who.resolve(name) for name in args.who]
+    shared = shared_world(pilots)
+    for pilot in pilots:
         for n in team_sizes(args.actors):
-            values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+            values = {**pilot.values, **shared, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+            values |= {"team.pilot": pilot.values["team.pilot"]}
             values |= {} if n is None else {"team.size": n}
             config = build(values)
             check(config, pilot.policy)
             for seed in range(args.first_seed, args.first_seed + args.seeds):
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy
+
+
+def shared_world(pilots: list[who.Who]) -> dict[str, Any]:
+    """The world of the run folders among WHO, for everybody in the table; ConfigError when they do not agree."""
+    worlds = [{k: v for k, v in p.values.items() if k in WORLD or k.startswith("world.")} for p in pilots]
+    worlds = [world for world in worlds if world]
+    for world in worlds[1:]:
+        differ = [key for key in world if world[key] != worlds[0].get(key)]
+        if differ:
+            raise ConfigError(f"the runs differ in {', '.join(differ)}: set it for all of them with --set, or apart")
+    return worlds[0] if worlds else {}
 
 
 def fly_one(mission: tuple[str, Config, bytes | None]) -> Flight:

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
     pilot = who.resolve(args.who)
-    values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+    values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args), **who.pilot_of(pilot)}
     world = mission.check(build(values), pilot.policy)
     out = mission.new_folder(args.out, "fly")
     code = mission.Mission(world, out, mission.command_line(), pilot.policy).run(in_one_process=args.lockstep)

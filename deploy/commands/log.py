@@ -10,9 +10,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from tmc.record import facts
+from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
-from tmc.record.reader import info, read, run_files
+from tmc.record.reader import Log, info, read, run_files
 
+JOURNAL_VIEWS = ("moves", "uncertainty", "events", "digest")
 VIEWS = ("info", "cat", "moves", "uncertainty", "events", "digest")
 
 
@@ -41,8 +43,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print one view."""
-    return _MAINS[args.view](args)
+    """Print one view; exit code 1 when the log that it is made from is damaged, for then it is not all there."""
+    damage = _damage(args.run) if args.view in JOURNAL_VIEWS else None
+    try:
+        code = _MAINS[args.view](args)
+    except RecordError as error:
+        raise RecordError(f"{error} ({damage})" if damage else str(error)) from None
+    if damage:
+        print(f"overfly: this is not all of it: {damage}", file=sys.stderr)
+    return 1 if damage else code
+
+
+def _damage(run: Path) -> str | None:
+    """What is wrong with the TMC's journal; a journal that still grows is not damaged."""
+    path = run_files(run).get("tmc")
+    if path is None:
+        return None
+    log = Log(path)
+    return None if path.suffix == ACTIVE and log.cut else log.damage
 
 
 def _files(run: Path) -> dict[str, Path]:

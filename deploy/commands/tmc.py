@@ -9,7 +9,7 @@ from pathlib import Path
 from deploy import mission, settings, who
 from tmc.__main__ import serve
 from tmc.kernel.config import build, flat
-from tmc.wire.sockets import feed_endpoint
+from tmc.wire.sockets import check_free
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,12 +24,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Serve until the mission is over."""
-    feed_endpoint(args.bind)
+    check_free(args.bind)
     config = settings.config_for(args.preset, settings.chosen(args))
     policy = None
     if args.fly:
         pilot = who.resolve(args.fly)
-        values = {**flat(config), **pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+        values = {
+            **flat(config),
+            **pilot.values,
+            "training.episodes": 1,
+            **who.FIXED,
+            **settings.chosen(args),
+            **who.pilot_of(pilot),
+        }
         config, policy = build(values), pilot.policy
     mission.check(config, policy)
     out = mission.new_folder(args.out, "tmc")

@@ -19,14 +19,15 @@ class Stop:
     """True once SIGTERM or SIGINT came; a second signal ends the process at once."""
 
     def __init__(self) -> None:
-        self.asked = False
-        for number in (signal.SIGTERM, signal.SIGINT):
+        self.asked, self.code = False, STOPPED
+        """Whether to stop, and the exit code of a process that did: 128 + the signal's number."""
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._note)
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         if self.asked:
             os._exit(128 + number)
-        self.asked = True
+        self.asked, self.code = True, 128 + number
 
     def __call__(self) -> bool:
         return self.asked

@@ -55,6 +55,13 @@ def free_port() -> int:
             return port
 
 
+def check_free(endpoint: str) -> None:
+    """Raise EndpointError unless both endpoints of a TMC can be bound here and now."""
+    with zmq.Context() as context:
+        for one in (endpoint, feed_endpoint(endpoint)):
+            router(context, one).close()
+
+
 def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Socket[Any]:
     """A bound ROUTER. A client that comes back takes over its name; a message to nobody raises."""
     _check_endpoint(endpoint)
