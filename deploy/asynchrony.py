@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from deploy import exactness
+from deploy.mission import check
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.grid import Grid
 from tmc.kernel.world import World
@@ -141,8 +142,13 @@ def fly(trial: Trial, team: int, hold: float, base: Mapping[str, Any], policy: b
     start = time.perf_counter()
     folder.mkdir(parents=True)
     road_map = folder.absolute() / "corners.txt"
-    road_map.write_text(raster(team, apart=trial.apart))
-    config, held_back = config_of(trial, team, hold, base, road_map)
+    try:
+        road_map.write_text(raster(team, apart=trial.apart))
+        config, held_back = config_of(trial, team, hold, base, road_map)
+        check(config, policy)
+    except BaseException:  # nothing was flown: nothing is left
+        shutil.rmtree(folder)
+        raise
     facts, reference = exactness.fly_both(config, policy, folder)
     difference = compare.first_difference(facts, reference)
     ahead = farthest(config, facts, folder / exactness.PROCESSES, held_back)
