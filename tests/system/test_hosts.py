@@ -1,4 +1,4 @@
-"""Three hosts with 20 ms and 2 % loss between them: UAVs there fly the cells that one process flies (issue 3)."""
+"""Three hosts with 20 ms and 2 % loss between them: UAVs there fly the cells that one process flies."""
 
 from __future__ import annotations
 
