@@ -63,7 +63,10 @@ class Airspace:
         for j in self._peers:
             if t < self._quiet[j]:
                 continue
-            where = self._cell(j, t, cell, self._reach)
+            try:
+                where = self._cell(j, t, cell, self._reach)
+            except Waiting:
+                raise Waiting(self._slowest(t, cell), t) from None
             if where >= 0 and (math.isinf(self.sensing) or self.grid.within(cell, where, self.sensing)):
                 seen.append(where)
             self._quiet[j] = self._quiet_until(j, t, cell, where)
@@ -84,6 +87,16 @@ class Airspace:
         if where < 0 and j not in self._lost and self.grid.chebyshev(centre, newest) - abs(t - s) <= reach:
             raise Waiting(j, t)
         return where
+
+    def _slowest(self, t: int, cell: int) -> int:
+        """Of the peers who keep this UAV from sensing at t, the one farthest back: the others will be there by then."""
+        far_back = sorted((self.tracks.newest(j)[0], j) for j in self._peers if t >= self._quiet[j])
+        for _, j in far_back:
+            try:
+                self._cell(j, t, cell, self._reach)
+            except Waiting:
+                return j
+        return far_back[0][1]  # it has come in since
 
     def _quiet_until(self, j: int, t: int, cell: int, where: int) -> int:
         """The first tick at which j and this UAV, flying towards each other from now on, could be within reach."""

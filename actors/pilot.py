@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from actors.airspace import Airspace, Tracks
 from actors.planners import Decider, Sight
-from tmc.kernel.grid import N_ACTIONS, OFF_GRID
+from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge
@@ -217,9 +217,9 @@ class Pilot:
         self.phase = Phase.MOVE
 
     def _move(self) -> None:
-        target = self.world.grid.target_lists[self.cell][self.action]
-        block = self._block(target)
-        cell = self.cell if block else target
+        cell, block = self.world.moves[self.cell][self.action]
+        if not block and self.airspace.held(self.t, self.cell, cell):
+            cell, block = self.cell, Block.UAV
         k = self.law.index_list[cell]
         u = self._before_visit(k, cell) if k >= 0 else 0.0
         self.leg.rewards.append(self.reward(bool(block), cell not in self.visited, k, u))
@@ -231,13 +231,6 @@ class Pilot:
         self.leg.blocks.append(block)
         self.steps += 1
         self.phase = Phase.SENSE
-
-    def _block(self, target: int) -> Block:
-        if target == OFF_GRID:
-            return Block.GRID
-        if self.world.map.blocked[target]:
-            return Block.OBSTACLE
-        return Block.UAV if self.airspace.held(self.t, self.cell, target) else Block.NONE
 
     def _before_visit(self, k: int, cell: int) -> float:
         """r^u by the UAV's own map: the uncertainty at t + 1 just before the visit resets it."""

@@ -33,11 +33,9 @@ SILENCE = 1.0
 """Seconds after which a message that was not answered goes out again."""
 STATUS_EVERY = 0.5
 """Seconds between two status messages in the log."""
-NAPS = (0.0, 50e-6, 100e-6, 200e-6, 400e-6, 800e-6, 1.6e-3, 3.2e-3, 5e-3)
-"""Seconds that a wait for a peer sleeps between two looks at its track."""
-LONG_NAP = 0.02
-"""Seconds that it then waits for a message of the TMC before it looks again; ten times as long in a long wait, which
-costs less than 1 % of a core."""
+NAP = 0.02
+"""Seconds that a wait for a peer's track sleeps before it looks at what the TMC sent; ten times as long in a long wait,
+which costs less than 1 % of a core."""
 
 
 class Left(Exception):  # noqa: N818  not an error: the flight is over
@@ -57,7 +55,8 @@ class Service:
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, endpoint, f"uav-{uav:03d}")
         self.log: LogWriter | None = None
-        self.waited, self._peer, self._known = 0.0, -1, (-1, -1)
+        self.waited, self._peer = 0.0, -1
+        self.table: TableTracks | None = None
         self.lead: Lead | None = None
         self.witness: Witness | None = None
         self._said = time.monotonic()
@@ -108,7 +107,7 @@ class Service:
         tracks: Tracks
         radio = None
         if welcome.tracks:
-            tracks = TableTracks(open_table(Path(welcome.tracks), team, config.training.ticks), self.uav)
+            tracks = self.table = TableTracks(open_table(Path(welcome.tracks), team, config.training.ticks), self.uav)
         else:
             tracks = radio = RadioTracks(self.uav, team, world.grid, observer.sensing, self._beacon)
         if stalls(config, self.uav):
@@ -195,26 +194,16 @@ class Service:
             raise Left(process.USAGE, f"the TMC refused: {error.text}")
 
     def _wait_for_peer(self, waiting: Waiting, tries: int) -> None:
-        """Wait for the cell of a peer. The table is looked at again soon; beacons wake the socket."""
+        """Wait for the cell of a peer: until its row of the table shows it, or its beacon wakes the socket."""
         start, self._peer = time.monotonic(), waiting.peer
-        if self.radio is not None:
-            if not self.sock.poll(200):
-                self.radio.ask(waiting.peer)
+        if self.table is not None:
+            self.table.wait(waiting.peer, waiting.tick, NAP * min(1 + tries, 10))
+        elif self.radio is not None and not self.sock.poll(200):
+            self.radio.ask(waiting.peer)
+        waited = time.monotonic() - start
+        if self.table is None or waited >= NAP:
             self._listen(0)
-        else:
-            self._wait_for_track(waiting.peer, tries)
-        self.waited += time.monotonic() - start
-
-    def _wait_for_track(self, peer: int, tries: int) -> None:
-        """Until the peer's row of the table shows something newer than what the pilot has looked at, or for a while."""
-        newest = self.pilot.airspace.tracks.newest
-        for nap in NAPS:
-            time.sleep(nap)
-            if not tries or newest(peer) != self._known:  # known before the pilot's last look: no step is missed
-                break
-        else:
-            self._listen(LONG_NAP * min(tries, 10))
-        self._known = newest(peer)
+        self.waited += waited
 
     def _stopped(self, bound: str, peer: int = -1) -> None:
         """In a trial: the UAV can fly no further for now, unless it is under way or has nothing to fly."""

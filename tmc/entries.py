@@ -43,11 +43,9 @@ def exchange(flight: Flight, done: Exchange, policy: int) -> list[Entry]:
 
 def truth(flight: Flight, fresh: Truth, steps: int, updates: int, policy: int) -> list[Entry]:
     """What became final: uncertainty and mean reward by tick, and in scenario I the new events."""
-    ticks_present = ((r, len(flight.present(t))) for t, r in enumerate(fresh.reward, fresh.first))
-    rewards = [float(r.sum()) / max(n, 1) for r, n in ticks_present]
     values = {
         "episode": flight.episode, "first": fresh.first, "steps": steps, "updates": updates, "policy": policy,
-        "uncertainty": fresh.uncertainty, "reward": rewards,
+        "uncertainty": fresh.uncertainty, "reward": fresh.reward,
     }  # fmt: skip
     entries = [Entry("/tmc/metrics", values)]
     if fresh.events:
@@ -63,7 +61,7 @@ def episode(flight: Flight, phase: str, epsilon: float, steps: int, updates: int
     return Entry("/tmc/episode", {
         "episode": flight.episode, "phase": phase, "starts": flight.starts, "ticks": max(flight.done, 0),
         "uncertainty": mean, "uncertainty_per_cell": mean / flight.world.law.cells.size,
-        "reward": [float(r) for r in flight.total_reward], "blocked_grid": flight.blocked[Block.GRID],
+        "reward": flight.total_reward, "blocked_grid": flight.blocked[Block.GRID],
         "blocked_obstacle": flight.blocked[Block.OBSTACLE], "blocked_uav": flight.blocked[Block.UAV],
         "epsilon": epsilon, "updates": updates, "steps": steps,
     })  # fmt: skip

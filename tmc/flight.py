@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.kernel.grid import OFF_GRID, STAY
+from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge, step_events
 from tmc.kernel.world import World
@@ -29,11 +29,13 @@ class RefusedError(ValueError):
 
 @dataclass(frozen=True)
 class Truth:
-    """What became final, one entry a tick from `first` on: sum_k u_k, the rewards (N,), and the events (tick, cell)."""
+    """What became final, one entry a tick from `first` on: sum_k u_k, the UAVs that were there and the mean of their
+    rewards; and the events (tick, cell)."""
 
     first: int
     uncertainty: list[float]
-    reward: list[NDArray[np.float32]]
+    present: list[int]
+    reward: list[float]
     events: list[tuple[int, int]]
 
 
@@ -62,6 +64,7 @@ class Flight:
         self.scenario = config.scenario
         self.starts = world.starts(episode)
         self.factor = world.initial_factor(episode)
+        self._due = [[i for i in range(self.N) if config.phase(i) == p] for p in range(config.T_u)]
         K, R = world.grid.size, world.law.cells.size
         self.cells = np.zeros((self.T + 1, self.N), "<u2")
         self.actions = np.zeros((self.T + 1, self.N), "u1")
@@ -81,12 +84,13 @@ class Flight:
         self.done = -1
         self.last_visit = np.zeros(R, "<u2")
         self.active = np.zeros(K, bool)
-        self.visited = np.zeros((self.N, K), bool)
-        self.visited_by_team = np.zeros(K, bool)
+        self.visited: list[set[int]] = [set() for _ in range(self.N)]
+        self.visited_by_team: set[int] = set()
         self.total_uncertainty = 0.0
-        self.total_reward = np.zeros(self.N)
+        self.rewards = np.zeros((self.T + 1, self.N), "<f4")
+        self.total_reward = [0.0] * self.N
         self.blocked = dict.fromkeys((Block.GRID, Block.OBSTACLE, Block.UAV), 0)
-        self._fresh = Truth(0, [], [], [])
+        self._fresh = Truth(0, [], [], [], [])
         self.base[:] = replay.add_frame(0, np.zeros(R, "u2"))
 
     @property
@@ -104,21 +108,21 @@ class Flight:
         self.blocks[moves, i] = record.blocks
         self.own_rewards[moves, i] = record.rewards
         self.reported[i] = last
-        seen = [*zip(range(first, last + 1), record.cells.tolist(), strict=True)]
-        seen += zip(record.seen_tick.tolist(), record.seen_cell.tolist(), strict=True)
-        for tick, cell in seen:
-            k = self.world.law.index_list[cell]
-            if k >= 0:
-                self.beliefs[i, k] = max(self.beliefs[i, k], tick)
+        index, belief = self.world.law.index_list, self.beliefs[i]
+        for tick, cell in enumerate(record.cells.tolist(), first):
+            if index[cell] >= 0:
+                belief[index[cell]] = tick  # the newest: a UAV's own visits come in their order
+        for tick, cell in zip(record.seen_tick.tolist(), record.seen_cell.tolist(), strict=True):
+            k = index[cell]
+            if k >= 0 and belief[k] < tick:
+                belief[k] = tick
 
     def _check(self, r: Record) -> None:
         if r.uav in self.lost:
             raise RefusedError(f"UAV {r.uav} was declared lost in this episode")
         if r.first != self.reported[r.uav] + 1:
             raise RefusedError(f"record of UAV {r.uav} starts at tick {r.first}, expected {self.reported[r.uav] + 1}")
-        due = (
-            next(t for t in range(r.first, self.T + 1) if self.world.config.due(r.uav, t)) if r.first <= self.T else -1
-        )
+        due = self.world.config.next_due(r.uav, r.first) if r.first <= self.T else -1
         if r.tick != due:
             raise RefusedError(f"record of UAV {r.uav} ends at tick {r.tick}, it is due at {due}")
         moves = r.tick - max(r.first, 1) + 1
@@ -133,33 +137,30 @@ class Flight:
 
     def _check_path(self, r: Record) -> None:
         """Every cell follows from the one before by the action, or is the same where the move was blocked."""
-        if r.cells.max() >= self.world.grid.size or self.world.map.blocked[r.cells].any():
+        cells, moves = r.cells.tolist(), self.world.moves
+        if max(cells) >= len(moves) or self.world.map.blocked[r.cells].any():
             raise RefusedError(f"record of UAV {r.uav} has a cell off the grid or on an obstacle")
-        if r.first == 0 and int(r.cells[0]) != self.starts[r.uav]:
+        if r.first == 0 and cells[0] != self.starts[r.uav]:
             raise RefusedError(f"UAV {r.uav} did not start on cell {self.starts[r.uav]}")
-        if r.actions.size and (r.actions.max() > 8 or r.blocks.max() > max(Block)):
+        if r.actions.size and (r.actions.max() > STAY or r.blocks.max() > max(Block)):
             raise RefusedError(f"record of UAV {r.uav} has an unknown action or block")
-        before = r.cells[:-1] if r.first == 0 else np.append(self.cells[r.first - 1, r.uav], r.cells[:-1])
-        after = r.cells[1:] if r.first == 0 else r.cells
-        targets = self.world.grid.targets[before, r.actions]
-        if (np.where(r.blocks == Block.NONE, targets, before) != after).any():
-            raise RefusedError(f"record of UAV {r.uav} jumps: a cell does not follow from the action before it")
-        if (self._static_block(targets) != np.where(r.blocks == Block.UAV, 0, r.blocks)).any():
-            raise RefusedError(f"record of UAV {r.uav} says that a move was blocked by what is not there")
-        if (r.actions[r.blocks == Block.UAV] == STAY).any():
-            raise RefusedError(f"record of UAV {r.uav} says that another UAV kept it from staying where it is")
-
-    def _static_block(self, targets: NDArray[np.int32]) -> NDArray[np.int64]:
-        """What the map says of moves: Block.GRID, Block.OBSTACLE or 0."""
-        obstacle = np.where(self.world.map.blocked[np.maximum(targets, 0)], int(Block.OBSTACLE), 0)
-        return np.where(targets == OFF_GRID, int(Block.GRID), obstacle)
+        here = cells.pop(0) if r.first == 0 else int(self.cells[r.first - 1, r.uav])
+        for action, block, cell in zip(r.actions.tolist(), r.blocks.tolist(), cells, strict=True):
+            after, static = moves[here][action]
+            if cell != (here if block else after) or (block == Block.NONE and static):
+                raise RefusedError(f"record of UAV {r.uav} jumps: a cell does not follow from the action before it")
+            if static != (0 if block == Block.UAV else block):
+                raise RefusedError(f"record of UAV {r.uav} says that a move was blocked by what is not there")
+            if block == Block.UAV and action == STAY:
+                raise RefusedError(f"record of UAV {r.uav} says that another UAV kept it from staying where it is")
+            here = cell
 
     def exchanges(self) -> list[Exchange]:
         """Run the exchange clock as far as the records allow; one entry for each that could be held."""
         done = []
         while self.next_exchange <= self.T:
             t = self.next_exchange
-            due = [i for i in range(self.N) if i not in self.lost and self.world.config.due(i, t)]
+            due = self.due(t)
             if any(self.reported[i] < t for i in due):
                 break
             if due:
@@ -167,12 +168,16 @@ class Flight:
             self.next_exchange += 1
         return done
 
+    def due(self, t: int) -> list[int]:
+        """The UAVs that ship a record at tick t."""
+        due = range(self.N) if t == self.T else self._due[t % self.world.config.T_u]
+        return [i for i in due if i not in self.lost]
+
     def _exchange(self, t: int, due: list[int]) -> Exchange:
         self.version += 1
         if self.scenario == 1:
             self._settle(t)
-            frame = self.replay.add_frame(t, self.active[self.world.law.cells])
-            self.base[t:, :] = frame
+            self.base[t : t + 2] = self.replay.add_frame(t, self.active[self.world.law.cells])
             active = np.flatnonzero(self.active).astype("<u2")
             return Exchange(t, self.version, due, float(active.size), EMPTY, active)
         for i in due:
@@ -183,16 +188,17 @@ class Flight:
             key = self.beliefs[i].tobytes()  # UAVs that believe the same share one frame
             if key not in numbers:
                 numbers[key] = self.replay.add_frame(t, self.beliefs[i])
-            self.base[t:, i] = numbers[key]
+            self.base[t : t + self.world.config.T_u + 1, i] = numbers[key]  # until the next exchange
         believed = float(self.uncertainty(self.believed, t).sum())
         return Exchange(t, self.version, due, believed, self.believed.copy(), EMPTY)
 
     def _apply_visits(self, i: int, t: int) -> None:
         """UAV i's visits up to t, all reported by now, into the map that the TMC believes."""
-        for tick in range(max(t - self.world.config.T_u, 0), t + 1):
-            k = self.world.law.index_list[self.cells[tick, i]]
-            if k >= 0:
-                self.believed[k] = max(self.believed[k], tick)
+        index, believed, first = self.world.law.index_list, self.believed, max(t - self.world.config.T_u, 0)
+        for tick, cell in enumerate(self.cells[first : t + 1, i].tolist(), first):
+            k = index[cell]
+            if k >= 0 and believed[k] < tick:
+                believed[k] = tick
 
     def answer(self, exchange: Exchange, policy: int, sequence: int) -> Map:
         """The TMC's answer at an exchange; `sequence`: the record that it answers."""
@@ -213,11 +219,12 @@ class Flight:
     def settle(self) -> Truth:
         """Run the truth clock up to the slowest UAV; returns what became final since the last call."""
         self._settle(min((t for i, t in enumerate(self.reported) if i not in self.lost), default=self.T))
-        truth, self._fresh = self._fresh, Truth(self.done + 1, [], [], [])
-        for t, reward in enumerate(truth.reward, truth.first):
+        truth, self._fresh = self._fresh, Truth(self.done + 1, [], [], [], [])
+        for t in range(truth.first, self.done + 1):
             # A lost UAV may have been seen until its next exchange, and that seeing remembered until the one after it.
             sure = not any(last < t <= last + 2 * self.world.config.T_u for last in self.lost.values())
-            self.replay.add_row(self.episode, t, self.cells[t], self.actions[t], reward, self.base[t], sure=sure)
+            rewards = self.rewards[t]
+            self.replay.add_row(self.episode, t, self.cells[t], self.actions[t], rewards, self.base[t], sure=sure)
         return truth
 
     def lose(self, uav: int) -> int:
@@ -233,34 +240,39 @@ class Flight:
     def _settle(self, upto: int) -> None:
         while self.done < upto:
             t = self.done = self.done + 1
-            reward = self._visit(t)
-            self._fresh.reward.append(reward.astype("<f4"))
-            self._fresh.uncertainty.append(self._true_uncertainty(t))
+            present = self.present(t)
+            rewards = self._visit(t, present)
+            self._fresh.present.append(len(present))
+            self._fresh.reward.append(sum(rewards) / max(len(present), 1))
+            self._fresh.uncertainty.append(self._true_uncertainty(t, present))
             if t:
                 self.total_uncertainty += self._fresh.uncertainty[-1]
-                self.total_reward += reward
-                for block in self.blocks[t][self.blocks[t] > 0].tolist():
-                    self.blocked[Block(block)] += 1
 
-    def _visit(self, t: int) -> NDArray[np.float64]:
-        """Rewards of all UAVs at tick t (Sec. III-B), shape (N,), then the visits of that tick."""
-        index, reward = self.world.law.index_list, np.zeros(self.N)
-        for i, cell in self.present(t):
+    def _visit(self, t: int, present: list[tuple[int, int]]) -> list[float]:
+        """Rewards of the UAVs that are there at tick t (Sec. III-B), then the visits of that tick."""
+        index, rewards = self.world.law.index_list, []
+        for i, cell in present:
             k = index[cell]
             if t:
-                reward[i] = self._reward(t, i, cell, k)
-            self.visited[i, cell] = True
-            self.visited_by_team[cell] = True
+                block = int(self.blocks[t, i])
+                reward = self._reward(t, i, cell, k, block)
+                self.rewards[t, i] = reward
+                self.total_reward[i] += reward
+                if block:
+                    self.blocked[Block(block)] += 1
+                rewards.append(reward)
+            self.visited[i].add(cell)
+            self.visited_by_team.add(cell)
             if k >= 0:
                 self.last_visit[k] = t
-        return reward
+        return rewards
 
-    def _reward(self, t: int, i: int, cell: int, k: int) -> float:
+    def _reward(self, t: int, i: int, cell: int, k: int, block: int) -> float:
         """By the true map, or as the UAV reckoned it; with novelty for the UAV, or for the team."""
-        rules, novel = self.world.config.reward, not self.visited[i, cell]
-        if self.blocks[t, i]:
+        rules, novel = self.world.config.reward, cell not in self.visited[i]
+        if block:
             return rules.collision
-        counted = novel if rules.novelty == "own" else not self.visited_by_team[cell]
+        counted = novel if rules.novelty == "own" else cell not in self.visited_by_team
         if rules.uncertainty == "own":
             return float(self.own_rewards[t, i]) + rules.new_cell * (counted - novel)
         return self.reward(False, counted, k, self._before_visit(k, cell, t))
@@ -272,12 +284,12 @@ class Flight:
             return float(self.active[cell])
         return self.world.law.value(k, int(self.last_visit[k]), t, self.factor)
 
-    def _true_uncertainty(self, t: int) -> float:
+    def _true_uncertainty(self, t: int, present: list[tuple[int, int]]) -> float:
         """sum_k u_k(t), the inner sum of eq. (6); in scenario I it also lets the events of the slot in."""
         if self.scenario == 2:
             return float(self.uncertainty(self.last_visit, t).sum())
         if t:
             arrivals = self.world.arrivals(self.episode, t)
-            self.active, new = step_events(self.active, [cell for _, cell in self.present(t)], arrivals)
+            self.active, new = step_events(self.active, [cell for _, cell in present], arrivals)
             self._fresh.events.extend((t, int(k)) for k in new)
         return float(self.active.sum())

@@ -79,8 +79,7 @@ class Station:
             missing = [uav_name(i) for i in self._away()]
             return missing + ([LEARNER] if self.learning and not self.policies.newest else [])
         flight, t = self.flight, self.flight.next_exchange
-        due = (i for i in range(flight.N) if i not in flight.lost and self.config.due(i, t))
-        return [uav_name(i) for i in due if flight.reported[i] < t]
+        return [uav_name(i) for i in flight.due(t) if flight.reported[i] < t]
 
     def _away(self) -> list[int]:
         """UAVs without a process."""
@@ -181,7 +180,7 @@ class Station:
             return
         moves = len(truth.uncertainty) - (truth.first == 0)
         self.ticks += moves
-        self.steps += sum(len(flight.present(t)) for t in range(max(truth.first, 1), flight.done + 1))
+        self.steps += sum(truth.present[-moves:]) if moves else 0
         self.limiter.insert(moves, len(self.replay))
         self.uncertainty = truth.uncertainty[-1]
         updates = self.limiter.updates

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import time
 from pathlib import Path
 
 import pytest
@@ -84,7 +85,7 @@ def _publish(path: Path) -> None:
 def test_two_processes_share_a_file(tmp_path: Path) -> None:
     path = tmp_path / "tracks"
     create_table(path, 2, 10)
-    assert path.stat().st_size == 8 * 2 * 12 and not any(path.read_bytes())
+    assert path.stat().st_size == 8 * 2 * 13 and not any(path.read_bytes())
     mine = TableTracks(open_table(path, 2, 10), 0)
     mine.begin(1, [0, 1])
     process = multiprocessing.get_context("spawn").Process(target=_publish, args=(path,))
@@ -92,6 +93,43 @@ def test_two_processes_share_a_file(tmp_path: Path) -> None:
     process.join(30)
     assert process.exitcode == 0
     assert mine.newest(1) == (3, 42) and mine.at(1, 3) == 42
+
+
+def _publish_slowly(path: Path) -> None:
+    tracks = TableTracks(open_table(path, 2, 10), 1)
+    tracks.begin(1, [0, 1])
+    for tick in range(1, 6):
+        time.sleep(0.05)
+        tracks.publish(tick, 40 + tick)
+
+
+def test_who_waits_is_woken_by_the_tick_that_it_waits_for(tmp_path: Path) -> None:
+    path = tmp_path / "tracks"
+    create_table(path, 2, 10)
+    mine = TableTracks(open_table(path, 2, 10), 0)
+    mine.begin(1, [0, 1])
+    process = multiprocessing.get_context("spawn").Process(target=_publish_slowly, args=(path,))
+    process.start()
+    looks, give_up = 0, time.monotonic() + 30
+    while mine.newest(1)[0] < 5 and time.monotonic() < give_up:
+        mine.wait(1, 5, 10.0)
+        looks += 1
+    process.join(30)
+    assert mine.at(1, 5) == 45
+    assert looks <= 6, "woken by what is published, not by looking again and again"
+
+
+def test_a_wait_for_what_is_there_or_never_comes_ends(tmp_path: Path) -> None:
+    table = TrackTable(2, 10)
+    mine, peer = TableTracks(table, 0), TableTracks(table, 1)
+    for tracks in (mine, peer):
+        tracks.begin(1, [0, 1])
+    peer.publish(3, 7)
+    start = time.monotonic()
+    mine.wait(1, 3, 20.0)
+    assert time.monotonic() - start < 10
+    mine.wait(1, 4, 0.01)
+    assert mine.newest(1) == (3, 7)
 
 
 def test_a_table_is_never_overwritten(tmp_path: Path) -> None:
@@ -106,7 +144,7 @@ def test_a_table_is_never_overwritten(tmp_path: Path) -> None:
 def test_a_table_of_another_size_is_refused(tmp_path: Path, team: int, ticks: int) -> None:
     path = tmp_path / "tracks"
     create_table(path, 2, 10)
-    with pytest.raises(ValueError, match=rf"has 192 bytes, expected {8 * team * (ticks + 2)}"):
+    with pytest.raises(ValueError, match=rf"has 208 bytes, expected {8 * team * (ticks + 3)}"):
         open_table(path, team, ticks)
 
 

@@ -185,7 +185,7 @@ def test_rewards_of_every_move(case: tuple[Any, Flight, Referee]) -> None:
     given_ = flown.station.replay.rewards[np.arange(1, T + 1)]
     assert given_.ravel().tolist() == pytest.approx(np.array(referee.rewards).ravel().tolist(), rel=1e-6, abs=1e-6)
     assert not flown.station.replay.rewards[np.arange(1)].any()
-    assert flight.total_reward.tolist() == pytest.approx(np.array(referee.rewards).sum(axis=0).tolist(), abs=1e-4)
+    assert flight.total_reward == pytest.approx(np.array(referee.rewards).sum(axis=0).tolist(), abs=1e-4)
     mean = np.array(referee.rewards).mean(axis=1).tolist()
     assert entries(flown, "/tmc/metrics", "reward")[1:] == pytest.approx(mean, rel=1e-6, abs=1e-6)
 

@@ -185,6 +185,10 @@ class Config:
         """True when UAV `uav` ships its record at tick t: at its phase, and at the episode's end."""
         return t % self.T_u == self.phase(uav) or t == self.training.ticks
 
+    def next_due(self, uav: int, t: int) -> int:
+        """The first tick from `t` on at which UAV `uav` ships its record."""
+        return min(t + (self.phase(uav) - t) % self.T_u, self.training.ticks)
+
     def epsilon(self, episode: int) -> float:
         """Exploration rate of an episode (counted from 1): linear over the first `fraction` of all episodes."""
         e, span = self.exploration, self.exploration.fraction * (self.training.episodes - 1)

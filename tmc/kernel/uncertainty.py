@@ -42,7 +42,7 @@ class UncertaintyLaw:
 
         `s`, shape (..., R): the initial map's factors 1 - u_k(0), for cells with `last_visit` 0, "not since the start".
         """
-        left = self._decay[self._offset + (t - last_visit.astype(np.int64))]
+        left = self._decay.take(self._offset + t - last_visit)
         if s is not None:
             left = np.where(last_visit == 0, s * left, left)
         return np.asarray(1.0 - left)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from tmc.kernel.config import Config, ConfigError
 from tmc.kernel.draws import Stream, distinct, uniforms
+from tmc.kernel.grid import OFF_GRID
+from tmc.kernel.reward import Block
 from tmc.kernel.roadmap import RoadMap, load_map
 from tmc.kernel.uncertainty import UncertaintyLaw, arrival_probability
 
@@ -21,6 +23,8 @@ class World:
         self.map = road_map or load_map(config.world.map, config.world.roads, config.world.obstacles)
         self.grid = self.map.grid
         self.law = UncertaintyLaw(self.alpha, config.training.ticks)
+        self.moves = self._moves()
+        """For each cell and action, as the map has it: the cell that the UAV is on afterwards, and what blocks it."""
         self._check()
 
     @cached_property
@@ -38,6 +42,16 @@ class World:
         """Cells that a UAV may start on."""
         road = self.config.world.start == "road"
         return np.flatnonzero(~self.map.blocked & (self.map.road if road else True))
+
+    def _moves(self) -> list[list[tuple[int, Block]]]:
+        blocked = self.map.blocked.tolist()
+
+        def move(cell: int, target: int) -> tuple[int, Block]:
+            if target == OFF_GRID:
+                return cell, Block.GRID
+            return (cell, Block.OBSTACLE) if blocked[target] else (target, Block.NONE)
+
+        return [[move(k, target) for target in targets] for k, targets in enumerate(self.grid.target_lists)]
 
     def _check(self) -> None:
         size, roads = self.config.team.size, int(self.map.road.sum())

@@ -333,6 +333,15 @@ def test_scenario_i_exchanges_every_tick_whatever_the_period(phase: str) -> None
     assert all(due_ticks(config, i) == [0, 1, 2, 3, 4, 5] for i in range(3))
 
 
+@pytest.mark.parametrize(("size", "period", "phase"), [(1, 1, "together"), (3, 10, "together"), (5, 7, "staggered")])
+def test_the_next_record_is_due_at_the_first_tick_that_is(size: int, period: int, phase: str) -> None:
+    values = {"team.size": size, "comms.period": period, "comms.phase": phase, "training.ticks": 25}
+    config = build(values)
+    for uav in range(size):
+        for t in range(26):
+            assert config.next_due(uav, t) == next(x for x in range(t, 26) if config.due(uav, x))
+
+
 @QUICK
 @given(st.integers(1, 80), st.integers(1, 60), st.integers(1, 30), st.sampled_from(["together", "staggered"]))
 def test_everybody_ships_at_least_every_T_u_ticks_and_at_the_end(  # noqa: N802

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from tmc.kernel.config import ConfigError, build
+from tmc.kernel.grid import N_ACTIONS, OFF_GRID
+from tmc.kernel.reward import Block
 from tmc.kernel.roadmap import MapError, load_map
 from tmc.kernel.world import World
 
@@ -204,3 +206,16 @@ def test_unknown_rates_are_refused_with_those_the_map_has(world_of: Worlds) -> N
 def test_an_unknown_map_is_refused() -> None:
     with pytest.raises(MapError, match="no map and no file"):
         World(build({"world.map": "atlantis"}))
+
+
+def test_moves_say_where_an_action_leads_and_what_blocks_it(toronto: World) -> None:
+    grid, blocked = toronto.grid, toronto.map.blocked
+    causes = set()
+    for cell in range(grid.size):
+        for action in range(N_ACTIONS):
+            target = int(grid.targets[cell, action])
+            after, block = toronto.moves[cell][action]
+            expected = Block.GRID if target == OFF_GRID else Block.OBSTACLE if blocked[target] else Block.NONE
+            assert (after, block) == (cell if expected else target, expected)
+            causes.add(block)
+    assert causes == {Block.NONE, Block.GRID, Block.OBSTACLE}
