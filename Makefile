@@ -11,7 +11,7 @@ demo: $(VENV)/.run
 	$(BIN)/overfly run quick --out $(RUN)
 	$(BIN)/overfly evaluate $(RUN) planner:random-road planner:random --seeds 5
 
-test: $(VENV)/.dev
+test: $(VENV)/.dev $(VENV)/.readers
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: $(VENV)/.dev
@@ -36,5 +36,11 @@ $(VENV)/.dev: $(VENV)/.run
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	@touch $@
 
+# What others read our logs with, for tests/readers. What cannot be had here is left out: its tests skip, and say why.
+$(VENV)/.readers: pyproject.toml constraints.txt tests/readers/package-lock.json | $(VENV)/.dev
+	-$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[readers]"
+	-npm ci --prefix tests/readers --ignore-scripts --no-audit --no-fund
+	@touch $@
+
 clean:
-	rm -rf $(VENV) build dist
+	rm -rf $(VENV) build dist tests/readers/node_modules

@@ -1,0 +1,86 @@
+"""Fixtures: the logs that every reader gets, and what our own reader says that they hold."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.readers.missions import make
+from tmc.record.reader import Entry, Log
+
+
+@dataclass
+class Topic:
+    """A topic of one log by our own reader: its schema, and its messages in file order."""
+
+    schema: str
+    entries: list[Entry] = field(default_factory=list)
+
+    @property
+    def times(self) -> list[int]:
+        return [entry.log_time for entry in self.entries]
+
+    @property
+    def messages(self) -> list[Any]:
+        return [entry.message for entry in self.entries]
+
+
+@pytest.fixture(scope="session")
+def missions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with all missions: flown once, by the first worker that needs them."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, ready = base / "readers", base / "readers.ready"
+    with (base / "readers.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not ready.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            ready.touch()
+    return folder
+
+
+FOLDERS = {
+    "finished": ("trained", "flown"),
+    "made": ("made",),
+    "resumed": ("resumed-killed", "resumed-cut"),
+    "recovered": ("recovered-killed", "recovered-cut"),
+}
+
+
+@pytest.fixture(params=FOLDERS)
+def logs(request: pytest.FixtureRequest, missions: Path) -> list[Path]:
+    """Every finished log: of runs that ended in order, made of these, or recovered of the killed one in each way."""
+    paths = [path for name in FOLDERS[request.param] for path in sorted((missions / name).glob("*.mcap"))]
+    assert paths
+    return paths
+
+
+@pytest.fixture
+def killed(missions: Path, tmp_path: Path) -> list[Path]:
+    """The logs as a kill leaves them: whole chunks, or torn; copied to names that end in `.mcap`."""
+    left = sorted(path for name in ("killed", "cut") for path in (missions / name).glob("*.active"))
+    assert left
+    return [Path(shutil.copy(path, tmp_path / f"{path.parent.name}-{path.stem}")) for path in left]
+
+
+@pytest.fixture
+def ours() -> Callable[[Path], dict[str, Topic]]:
+    """{topic: what our own reader finds of it}."""
+
+    def read(path: Path) -> dict[str, Topic]:
+        topics: dict[str, Topic] = {}
+        schemas = {raw.topic: raw.schema for raw in Log(path).raw()}
+        for entry in Log(path).entries():
+            topics.setdefault(entry.topic, Topic(schemas[entry.topic])).entries.append(entry)
+        return topics
+
+    return read

@@ -1,0 +1,121 @@
+"""Real logs for the readers: two missions that ended in order, and one whose processes were all killed in flight."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from tmc.kernel.config import Journal
+from tmc.record.channels import ACTIVE
+from tmc.record.errors import RecordError
+from tmc.record.reader import info
+from tmc.record.writer import LogWriter
+
+SMALL = ("--set", "replay.learn_start=60", "--set", "dqn.batch=16", "--set", "journal.flush=0.1")
+TRAINED = ("run", "quick", "--scenario", "1", "--ticks", "60", "--episodes", "2", "--set", "trial.witness=true", *SMALL)
+FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60")
+# Slow enough to be still in flight when all have written.
+KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", *SMALL)
+WRITERS = ("tmc", "learner", "uav-000", "uav-001")
+_COMMAND = (sys.executable, "-P", "-m", "deploy.cli")
+
+
+def make(folder: Path) -> None:
+    """Fly the missions: finished logs are `*/*.mcap`; `killed` and `cut` hold `*.mcap.active` as a kill leaves them."""
+    for name, mission in (("trained", TRAINED), ("flown", FLOWN)):
+        done = overfly(*mission, "--out", folder / name)
+        assert done.returncode == 0, done.stderr
+    for view in ("merge", "replay"):
+        done = overfly("log", view, folder / "flown", "--out", folder / "made" / f"{view}.mcap")
+        assert done.returncode == 0, done.stderr
+    kill_in_flight(folder / "killed")
+    cut(folder / "killed" / f"tmc.mcap{ACTIVE}", folder / "cut")
+    for left in (folder / "killed", folder / "cut"):
+        resume(left, folder / f"resumed-{left.name}")
+        recover(left, folder / f"recovered-{left.name}")
+
+
+def overfly(*args: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*_COMMAND, *map(str, args)], capture_output=True, text=True, timeout=120, check=False)
+
+
+def cut(log: Path, folder: Path) -> None:
+    """A copy of the log as if the kill had torn what was being written."""
+    folder.mkdir()
+    whole = log.read_bytes()
+    (folder / log.name).write_bytes(whole[: len(whole) * 3 // 4])
+
+
+def resume(left: Path, folder: Path) -> None:
+    """Recover logs as processes do that are started again and have nothing more to say."""
+    for active in _copies(left, folder):
+        path = active.with_name(active.name.removesuffix(ACTIVE))
+        LogWriter(path, path.stem, Journal(), {}, resume=True).close()
+
+
+def recover(left: Path, folder: Path) -> None:
+    """Recover logs as a user does; exit code 3 says that something is lost."""
+    _copies(left, folder)
+    done = overfly("log", "recover", folder, "--in-place")
+    assert done.returncode in (0, 3), done.stderr
+
+
+def _copies(left: Path, folder: Path) -> list[Path]:
+    folder.mkdir()
+    return [Path(shutil.copy(path, folder)) for path in sorted(left.glob(f"*{ACTIVE}"))]
+
+
+def kill_in_flight(out: Path) -> None:
+    """SIGKILL supervisor, TMC, learner and UAVs once each of them has a message in its log."""
+    with subprocess.Popen([*_COMMAND, *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
+        try:
+            _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in WRITERS])
+            time.sleep(0.5)
+        finally:
+            family = [run.pid, *_descendants(run.pid)]  # the supervisor first: it would start the others again
+            for process in family:
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
+    assert len(family) >= 1 + len(WRITERS)
+    while any(map(_alive, family)):
+        time.sleep(0.02)
+
+
+def _await_messages(run: subprocess.Popen[bytes], logs: list[Path]) -> None:
+    until = time.monotonic() + 60
+    while not all(map(_has_messages, logs)):
+        assert run.poll() is None and time.monotonic() < until, "the mission did not get under way"
+        time.sleep(0.1)
+
+
+def _has_messages(log: Path) -> bool:
+    try:
+        return bool(info(log).topics)
+    except RecordError:  # not there yet, or empty
+        return False
+
+
+def _descendants(process: int) -> list[int]:
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            parent = stat.read_text().rpartition(")")[2].split()[1]
+            children.setdefault(int(parent), []).append(int(stat.parent.name))
+    found = [process]
+    for known in found:
+        found += children.get(known, [])
+    return found[1:]
+
+
+def _alive(process: int) -> bool:
+    """A process that was killed and not yet waited for by its parent has no command line any more."""
+    try:
+        return bool((Path("/proc") / str(process) / "cmdline").read_bytes())
+    except OSError:
+        return False
