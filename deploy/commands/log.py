@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
+from deploy.commands import log_check, log_export
 from tmc.record import facts
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
@@ -16,6 +17,8 @@ from tmc.record.reader import Log, info, read, run_files
 
 JOURNAL_VIEWS = ("moves", "uncertainty", "events", "digest")
 VIEWS = ("info", "cat", "moves", "uncertainty", "events", "digest")
+MORE = (log_check, log_export)
+"""Modules with views of their own."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             sub.add_argument("--json", action="store_true", help="print it as JSON")
         if view == "cat":
             sub.add_argument("--topic", action="append", metavar="TOPIC", help="only this topic; may be repeated")
+    for module in MORE:
+        for view, text in module.ABOUT.items():
+            module.add_options(view, views.add_parser(view, help=text, description=text))
 
 
 def main(args: argparse.Namespace) -> int:
@@ -120,4 +126,4 @@ _MAINS: dict[str, Callable[[argparse.Namespace], int]] = {
     "uncertainty": lambda a: _csv("tick,value", facts.uncertainty(a.run, a.episode)),
     "events": lambda a: _csv("tick,cell", facts.events(a.run, a.episode)),
     "digest": _digest,
-}
+} | {view: main for module in MORE for view, main in module.MAINS.items()}

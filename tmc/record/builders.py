@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,10 @@ FRAME = "map"
 
 LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
 """Levels of foxglove.Log by name."""
+
+NUMERIC = {"|u1": "UINT8", "<u4": "UINT32", "<f4": "FLOAT32"}
+"""Types of the fields of a Grid, by NumPy's name."""
+_KINDS = {name: kind for kind, name in NUMERIC.items()}
 
 _NUMBERS = ("uav", "life", "sequence", "episode", "first", "tick", "version", "policy")
 _ARRAYS = {"cells": "<u2", "actions": "u1", "blocks": "u1", "rewards": "<f4", "seen_tick": "<u2", "seen_cell": "<u2"}
@@ -48,31 +53,54 @@ def _array(values: Any, kind: str) -> NDArray[Any]:
 
 
 def grid(last_visit: NDArray[np.integer], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
-    """A foxglove.Grid of the ticks of the last visits, shape (K,), in cells of `cell_m` metres.
+    """A foxglove.Grid of the ticks of the last visits, shape (K,), uint32; see `layers`. `last_visit` undoes it."""
+    return layers({"last_visit": last_visit.astype("<u4")}, rows, cols, cell_m, time_ns)
 
-    A Grid grows to the north, our rows to the south: so the rows are turned round. `last_visit` undoes it.
+
+def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
+    """A foxglove.Grid of cells of `cell_m` metres with these fields, each of shape (K,) and of a dtype of NUMERIC.
+
+    A Grid grows to the north, our rows to the south: so the rows are turned round. `layer` undoes it.
     """
-    if last_visit.shape != (rows * cols,):
-        raise RecordError(f"a grid of {rows} x {cols} cells needs {rows * cols} values, not {last_visit.shape}")
+    for values in fields.values():
+        if values.shape != (rows * cols,):
+            raise RecordError(f"a grid of {rows} x {cols} cells needs {rows * cols} values, not {values.shape}")
+    cells = np.empty(rows * cols, [(name, values.dtype) for name, values in fields.items()])
+    for name, values in fields.items():
+        cells[name] = values
     message = message_class("foxglove.Grid")(
         frame_id=FRAME,
         column_count=cols,
-        cell_stride=4,
-        row_stride=4 * cols,
-        data=last_visit.reshape(rows, cols)[::-1].astype("<u4").tobytes(),
+        cell_stride=cells.itemsize,
+        row_stride=cells.itemsize * cols,
+        data=cells.reshape(rows, cols)[::-1].tobytes(),
     )
     message.timestamp.FromNanoseconds(time_ns)
     # Converters look for the sub-messages of a pose, and protobuf leaves out those that are all zero.
     message.pose.position.SetInParent()
     message.pose.orientation.w = 1.0
     message.cell_size.x = message.cell_size.y = cell_m
-    message.fields.add(name="last_visit", offset=0, type=foxglove("PackedElementField").PackedElementField.UINT32)
+    numeric = foxglove("PackedElementField").PackedElementField.NumericType
+    for name, (dtype, offset, *_) in (cells.dtype.fields or {}).items():
+        message.fields.add(name=name, offset=offset, type=numeric.Value(NUMERIC[dtype.str]))
     return message
+
+
+def layer(message: Any, name: str) -> NDArray[Any]:
+    """Shape (K,): the field `name` as `layers` was given it; RecordError when the grid has no such field."""
+    names = [field.name for field in message.fields]
+    if name not in names:
+        raise RecordError(f"the grid has no field {name}: it has {', '.join(names)}")
+    field = message.fields[names.index(name)]
+    kind = np.dtype(_KINDS[foxglove("PackedElementField").PackedElementField.NumericType.Name(field.type)])
+    cells = np.frombuffer(message.data, np.uint8).reshape(-1, message.cell_stride)
+    values = cells[:, field.offset : field.offset + kind.itemsize].copy().view(kind)
+    return np.asarray(values.reshape(-1, message.column_count)[::-1].ravel())
 
 
 def last_visit(message: Any) -> NDArray[np.uint32]:
     """Shape (K,): the ticks that `grid` was given."""
-    return np.frombuffer(message.data, "<u4").reshape(-1, message.column_count)[::-1].ravel()
+    return layer(message, "last_visit")
 
 
 def location_fix(lon: float, lat: float, time_ns: int, frame: str = FRAME, altitude: float = 0.0) -> Any:

@@ -45,6 +45,27 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("/log", "foxglove.Log", EVERY, "what the process says"),
 )
 
+REPLAY = "replay"
+"""Writer of the topics of a replay file."""
+REPLAY_CHANNELS: tuple[Channel, ...] = (
+    Channel("/tmc/last_visit", "foxglove.Grid", REPLAY, "the true map: last_visit, uint32 ticks; uncertainty, float32"),
+    Channel("/uav/<id>/belief", "foxglove.Grid", REPLAY, "the map that the UAV acts on, in the same fields"),
+    Channel("/uav/<id>/pose", "foxglove.PoseInFrame", REPLAY, "position in the frame map, turned to the last move"),
+    Channel("/uav/<id>/fix", "foxglove.LocationFix", REPLAY, "position in degrees, where the map has a place on earth"),
+    Channel(
+        "/uav/<id>/tick", "overfly.UavTick", REPLAY, "cell, move, reward and the uncertainty that the UAV believes"
+    ),
+    Channel("/scene", "foxglove.SceneUpdate", REPLAY, "each UAV with its number and its trail of 20 cells"),
+    Channel(
+        "/tmc/tick", "overfly.TeamTick", REPLAY, "uncertainty, true and believed by the TMC; reward, blocked moves"
+    ),
+    Channel("/log", "foxglove.Log", REPLAY, "starts, blocked moves, and exchanges where T_u > 1, in words"),
+    Channel("/map/terrain", "foxglove.Grid", REPLAY, "once: terrain, uint8: 0 free, 1 road, 2 blocked"),
+    Channel("/map/roads", "foxglove.GeoJSON", REPLAY, "once: the road network, where the map has streets"),
+    Channel("/tf", "foxglove.FrameTransform", REPLAY, "once: from world to map"),
+)
+"""What `overfly log replay` writes, at every tick unless it says once."""
+
 
 def uav_topic(uav: int, name: str) -> str:
     """The topic of one UAV, such as `/uav/3/record`."""

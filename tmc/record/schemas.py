@@ -34,6 +34,10 @@ TYPES: dict[str, str] = {
     "UavStatus": "uint32 uav, uint32 episode, uint32 tick, uint32 cell, double waited, double steps_per_second, "
     "uint32 explored, sint32 lead, uint32 lead_most, uint32 lead_tick, string lead_bound",
     "Witness": "uint32 uav, uint32 episode, uint32 first, uint32 tick, fixed64* hashes",
+    "TeamTick": "uint32 episode, uint32 tick, double uncertainty, double uncertainty_per_cell, double believed, "
+    "double believed_per_cell, double reward, uint32 blocked, uint32 answered, uint32 uavs",
+    "UavTick": "uint32 uav, uint32 episode, uint32 tick, uint32 cell, uint32 action, uint32 block, double reward, "
+    "double believed, double believed_per_cell, uint32 exchanged, uint64 policy",
 }
 
 
@@ -81,6 +85,8 @@ Policy = _own("Policy")
 LearnerMetrics = _own("LearnerMetrics")
 UavStatus = _own("UavStatus")
 Witness = _own("Witness")
+TeamTick = _own("TeamTick")
+UavTick = _own("UavTick")
 
 
 @cache

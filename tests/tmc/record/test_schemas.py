@@ -40,12 +40,13 @@ def test_the_proto_file_and_the_code_agree():
 
 
 def test_every_schema_of_the_table_describes_itself():
-    for channel in channels.CHANNELS:
+    for channel in (*channels.CHANNELS, *channels.REPLAY_CHANNELS):
         files = descriptor_pb2.FileDescriptorSet.FromString(schemas.schema_bytes(channel.schema))
         package, _, name = channel.schema.partition(".")
         assert files.file[-1].package == package
         assert name in [m.name for m in files.file[-1].message_type]
-    assert {f"overfly.{name}" for name in schemas.TYPES} <= {c.schema for c in channels.CHANNELS}
+    used = {c.schema for c in (*channels.CHANNELS, *channels.REPLAY_CHANNELS)}
+    assert {f"overfly.{name}" for name in schemas.TYPES} <= used
 
 
 @pytest.mark.parametrize("name", ["overfly.Nothing", "foxglove.Nothing", "foxglove.os.path", "ros.Grid"])
@@ -63,6 +64,10 @@ def rows(text, heading):
 
 def test_the_document_shows_the_table_of_topics():
     assert rows(DOC.read_text(), "Topics") == [(c.topic, c.schema, c.process, c.about) for c in channels.CHANNELS]
+
+
+def test_the_document_shows_the_table_of_topics_of_replay_files():
+    assert rows(DOC.read_text(), "Replay files") == [(c.topic, c.schema, c.about) for c in channels.REPLAY_CHANNELS]
 
 
 def test_the_document_shows_the_types():

@@ -1,0 +1,72 @@
+"""The layout in which Lichtblick and Foxglove show a replay file: `layout.json` is the template, filled in here.
+
+In the template an entry with `<id>` stands for one of each UAV, with its `<colour>`; `<first>` is true of UAV 0 only.
+`<x>`, `<y>` and `<height>` are the centre and the height of the view in metres, `<cell>` is the width of a cell.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from importlib.resources import files
+from typing import Any
+
+FILE = "layout.json"
+"""The template's name in this package, and that of the attachment in a replay file."""
+MARGIN = 1.1
+"""Height of the view over that of the map."""
+Values = Mapping[str, Any]
+
+
+def layout(topics: Collection[str], colours: Sequence[str], rows: int, cols: int, cell_m: float) -> dict[str, Any]:
+    """The layout for a file with these topics; `colours`: one a UAV, `#RRGGBB`. Topics the file lacks are left out."""
+    height = MARGIN * max(rows, cols) * cell_m
+    values = {"<x>": cols * cell_m / 2, "<y>": rows * cell_m / 2, "<height>": height, "<cell>": cell_m}
+    uavs = [{"<id>": str(i), "<colour>": colour, "<first>": i == 0} for i, colour in enumerate(colours)]
+    template = json.loads(files("tmc.record").joinpath(FILE).read_text("utf-8"))
+    return dict(_kept(_filled(template, values, uavs), topics))
+
+
+def topics_of(node: Any) -> Iterator[str]:
+    """Every topic that a layout names: a string that begins with a slash, up to the field of its messages."""
+    if isinstance(node, dict):
+        node = [*node.keys(), *node.values()]
+    if isinstance(node, list):
+        for item in node:
+            yield from topics_of(item)
+    elif isinstance(node, str) and node.startswith("/"):
+        yield node.partition(".")[0]
+
+
+def _filled(node: Any, values: Values, uavs: Sequence[Values]) -> Any:
+    if isinstance(node, dict):
+        return {
+            _text(key, own): _filled(value, own, uavs)
+            for key, value in node.items()
+            for own in _owners(key, values, uavs)
+        }
+    if isinstance(node, list):
+        return [_filled(item, own, uavs) for item in node for own in _owners(json.dumps(item), values, uavs)]
+    if isinstance(node, str):
+        return values[node] if node in values else _text(node, values)
+    return node
+
+
+def _owners(text: str, values: Values, uavs: Sequence[Values]) -> list[Values]:
+    """The values for each entry that one of the template becomes."""
+    return [{**values, **uav} for uav in uavs] if "<id>" in text and "<id>" not in values else [values]
+
+
+def _text(text: str, values: Values) -> str:
+    for name in ("<id>", "<colour>"):
+        text = text.replace(name, str(values.get(name, name)))
+    return text
+
+
+def _kept(node: Any, topics: Collection[str]) -> Any:
+    """Without the entries that name a topic which is not there."""
+    if isinstance(node, dict):
+        return {key: _kept(value, topics) for key, value in node.items() if set(topics_of(key)) <= set(topics)}
+    if isinstance(node, list):
+        return [_kept(item, topics) for item in node if set(topics_of(item)) <= set(topics)]
+    return node

@@ -1,0 +1,142 @@
+"""One MCAP file of the logs of all processes of a run, in order of log time."""
+
+from __future__ import annotations
+
+import heapq
+import operator
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from mcap.records import Attachment, Metadata
+
+from tmc.record.channels import ACTIVE
+from tmc.record.errors import RecordError
+from tmc.record.export import Export
+from tmc.record.frames import DamageError, Raw, contents
+from tmc.record.reader import Log
+
+NAME = "overfly/merged"
+"""The metadata record that a merged file has more than the files it is made of."""
+_PREFIX = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
+_TIME = operator.attrgetter("log_time")
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What came of it: how many messages of how many files.
+
+    `damage`: what is wrong with them, a sentence each. `open`: files that were not closed, as those of a run that
+    goes on or was killed.
+    """
+
+    path: Path
+    files: int
+    messages: int
+    damage: tuple[str, ...]
+    open: tuple[Path, ...]
+
+
+@dataclass
+class _Source:
+    """A file to merge. `ordered`: its times never go back, as in every log that Overfly wrote."""
+
+    process: str
+    log: Log
+    attachments: list[Attachment] = field(default_factory=list)
+    metadata: list[Metadata] = field(default_factory=list)
+    messages: int = 0
+    ordered: bool = True
+
+    def by_time(self) -> Iterable[Raw]:
+        """Its sound messages by log time; those of one time in the order of the file."""
+        return self.log.raw() if self.ordered else sorted(self.log.raw(), key=_TIME)
+
+
+def merge(
+    files: Mapping[str, Path], out: Path, prefix: str = "", show: Callable[[int, int], None] = lambda _done, _all: None
+) -> Merged:
+    """Write all sound messages of `files` ({process: log}) to `out`, by log time, then in the order of the files.
+
+    `prefix` goes before every topic: `A` makes `/A/tmc/sync`. `show` gets the messages written, and all of them.
+    What is damaged is merged up to the damage. Raises RecordError when nothing can be read or `out` not be written.
+    """
+    before = topic_prefix(prefix)
+    if out.resolve() in {path.resolve() for path in files.values()}:
+        raise RecordError(f"{out} is one of the files to merge: choose another name for the merged one")
+    sources, damage = _sources(files)
+    total, written = sum(source.messages for source in sources), 0
+    with Export(out) as export:
+        _carry_over(sources, export, before)
+        for process, raw in _in_order(sources):
+            export.put(
+                before + raw.topic, raw.schema, raw.described, raw.data, raw.log_time, raw.publish_time,
+                raw.sequence, process,
+            )  # fmt: skip
+            written += 1
+            show(written, total)
+    logs = [source.log for source in sources]
+    still_open = {log.path for log in logs if log.path.name.endswith(ACTIVE) and log.cut}
+    damage += [log.damage for log in logs if log.damage and log.path not in still_open]
+    return Merged(out, len(sources), written, tuple(damage), tuple(sorted(still_open)))
+
+
+def topic_prefix(prefix: str) -> str:
+    """`/A` of `A`, `A/` or `/A/`; empty of nothing. RecordError for what viewers would not take in a topic."""
+    bare = prefix.strip("/")
+    if bare and not _PREFIX.fullmatch(bare):
+        raise RecordError(f"--prefix {prefix} is no part of a topic: use letters, digits, _, - and / between them")
+    return f"/{bare}" if bare else ""
+
+
+def _sources(files: Mapping[str, Path]) -> tuple[list[_Source], list[str]]:
+    """The files that can be read, and sentences on those that cannot; RecordError when that is all of them."""
+    sources, unreadable = [], []
+    for process, path in files.items():
+        try:
+            sources.append(_survey(process, path))
+        except RecordError as error:  # empty, or no log at all: the rest of the run is still worth merging
+            unreadable.append(str(error))
+    if not sources:
+        raise RecordError("; ".join(unreadable))
+    return sources, unreadable
+
+
+def _survey(process: str, path: Path) -> _Source:
+    source, last = _Source(process, Log(path)), 0
+    try:
+        with path.open("rb") as file:
+            for item in contents(file):
+                if isinstance(item, Attachment):
+                    source.attachments.append(item)
+                elif isinstance(item, Metadata):
+                    source.metadata.append(item)
+                elif item:
+                    times = [last, *(raw.log_time for raw in item)]
+                    source.ordered &= all(a <= b for a, b in pairwise(times))
+                    source.messages, last = source.messages + len(item), times[-1]
+    except DamageError:
+        pass  # `Log.damage` has it in words
+    return source
+
+
+def _carry_over(sources: list[_Source], export: Export, prefix: str) -> None:
+    """Metadata and attachments. Attachments of two processes that share a name but not their data say whose."""
+    for source in sources:
+        for record in source.metadata:
+            export.add_metadata(record.name, record.metadata)
+    export.add_metadata(NAME, {"files": " ".join(s.log.path.name for s in sources), "prefix": prefix})
+    kept: dict[str, bytes] = {}
+    for source in sources:
+        for a in source.attachments:
+            name = a.name if kept.setdefault(a.name, a.data) == a.data else f"{source.process}/{a.name}"
+            export.attach(name, a.media_type, a.data, a.log_time, a.create_time)
+
+
+def _in_order(sources: list[_Source]) -> Iterator[tuple[str, Raw]]:
+    def told(source: _Source) -> Iterator[tuple[str, Raw]]:
+        return ((source.process, raw) for raw in source.by_time())
+
+    return heapq.merge(*map(told, sources), key=lambda pair: pair[1].log_time)

@@ -1,0 +1,94 @@
+"""Messages that viewers draw: poses, frames and the scene. All in the frame of the grid, metres, x east, y north.
+
+Every field of a position is set, zero or not: converters of viewers look for the sub-messages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from tmc.record.builders import FRAME
+from tmc.record.schemas import foxglove, message_class
+
+WORLD = "world"
+"""The frame above the grid's: the same place."""
+SHAPES: tuple[tuple[str, dict[str, float]], ...] = (
+    ("spheres", {}),
+    ("cubes", {}),
+    ("cylinders", {"bottom_scale": 1.0, "top_scale": 1.0}),
+    ("cylinders", {"bottom_scale": 1.0, "top_scale": 0.0}),
+)
+"""What UAVs are drawn as, the next one each time that the colours are used up: a field of SceneEntity, and its own."""
+HEIGHT = 0.5
+"""Where UAVs and their trails are drawn above the map, in cells: the lowest UAV is furthest up."""
+Point = tuple[float, float]
+
+
+def pose_in_frame(at: Point, yaw: float, time_ns: int) -> Any:
+    """A foxglove.PoseInFrame; `yaw`: radians from the east, to the north."""
+    message = message_class("foxglove.PoseInFrame")(frame_id=FRAME)
+    message.timestamp.FromNanoseconds(time_ns)
+    _place(message.pose, at, 0.0, yaw)
+    return message
+
+
+def world_to_map(time_ns: int) -> Any:
+    """The foxglove.FrameTransform that viewers need once: the grid lies where the world does."""
+    message = message_class("foxglove.FrameTransform")(parent_frame_id=WORLD, child_frame_id=FRAME)
+    message.timestamp.FromNanoseconds(time_ns)
+    message.translation.x = message.translation.y = message.translation.z = 0.0
+    message.rotation.w = 1.0
+    return message
+
+
+def scene(entities: Iterable[Any], gone: Iterable[str], time_ns: int) -> Any:
+    """A foxglove.SceneUpdate: these entities as they are now, and without those that are gone."""
+    message = message_class("foxglove.SceneUpdate")(entities=entities)
+    matching = foxglove("SceneEntityDeletion").SceneEntityDeletion.MATCHING_ID
+    for name in gone:
+        message.deletions.add(type=matching, id=name).timestamp.FromNanoseconds(time_ns)
+    return message
+
+
+def uav_entity(uav: int, trail: Sequence[Point], colour: str, shape: int, cell_m: float, time_ns: int) -> Any:
+    """A foxglove.SceneEntity `uav-<id>`: a body at the trail's last place, its number beside it, and the trail.
+
+    `colour`: `#RRGGBB`; `shape`: a place in SHAPES, over again after the last.
+    """
+    entity = message_class("foxglove.SceneEntity")(frame_id=FRAME, id=entity_id(uav))
+    entity.timestamp.FromNanoseconds(time_ns)
+    entity.lifetime.FromNanoseconds(0)  # until it is replaced or deleted
+    z = HEIGHT * cell_m / (1 + uav / 100)
+    x, y = trail[-1]
+    kind, scales = SHAPES[shape % len(SHAPES)]
+    body = getattr(entity, kind).add(**scales)
+    _place(body.pose, (x, y), z)
+    body.size.x = body.size.y = body.size.z = 0.7 * cell_m
+    _paint(body.color, colour)
+    text = entity.texts.add(billboard=True, font_size=18, scale_invariant=True, text=str(uav))
+    _place(text.pose, (x + 0.6 * cell_m, y + 0.6 * cell_m), z)
+    _paint(text.color, "#000000")
+    line = entity.lines.add(type=foxglove("LinePrimitive").LinePrimitive.LINE_STRIP, thickness=4, scale_invariant=True)
+    _place(line.pose, (0.0, 0.0), 0.0)
+    for px, py in trail:
+        line.points.add(x=px, y=py, z=z)
+    _paint(line.color, colour)
+    return entity
+
+
+def entity_id(uav: int) -> str:
+    """What the scene calls a UAV."""
+    return f"uav-{uav}"
+
+
+def _place(pose: Any, at: Point, z: float, yaw: float = 0.0) -> None:
+    pose.position.x, pose.position.y, pose.position.z = *at, z
+    pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+def _paint(color: Any, colour: str) -> None:
+    """`colour`: `#RRGGBB`."""
+    color.r, color.g, color.b = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    color.a = 1.0
