@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from pathlib import Path
+from typing import IO, Any
 
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a disk that holds no more."""
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+"""Errors of a file system that knows no locks: there, nothing can be held."""
 
 
 def left_behind(path: Path, resume: bool) -> Path | None:
@@ -22,6 +29,37 @@ def left_behind(path: Path, resume: bool) -> Path | None:
     return None
 
 
+def open_held(path: Path, mode: str) -> Any:
+    """Open a log and keep other writers away from it until it is closed; RecordError when one has it already."""
+    file: IO[bytes] = path.open(mode)
+    try:
+        _hold(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _hold(file: IO[bytes], path: Path) -> None:
+    try:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RecordError(f"{path} is being written by another process: end that one first") from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+    if not _named(file, path):
+        raise RecordError(f"{path} was just taken over by another process: end that one first")
+
+
+def _named(file: IO[bytes], path: Path) -> bool:
+    """True while `path` is still the name of an open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
 def sync_folder(folder: Path) -> None:
     """Wait until the disk knows the names in a folder."""
     number = os.open(folder, os.O_RDONLY)
@@ -33,6 +71,6 @@ def sync_folder(folder: Path) -> None:
 
 def unwritable(path: Path, error: OSError) -> str:
     """Why a log cannot be written, and the mend."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    if error.errno in FULL:
         return f"the disk that holds {path} is full: free some space and resume; what was flushed stays readable"
     return f"{path} cannot be written ({error.strerror}): make its folder exist and writable, or choose another one"

@@ -20,6 +20,8 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
 MAGIC = b"\x89MCAP0\r\n"
+RECOVERED = "overfly/recovered"
+"""Metadata of a file that was made of what was sound in another one: what is missing in it, and that this is known."""
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _DATA = frozenset((Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA))
@@ -112,7 +114,9 @@ def contents(file: IO[bytes]) -> Iterator[list[Raw] | Metadata | Attachment | No
             if opcode == Opcode.CHUNK:
                 yield chunks.messages(body)
             elif opcode == Opcode.METADATA:
-                yield Metadata.read(ReadDataStream(BytesIO(body)))
+                metadata = Metadata.read(ReadDataStream(BytesIO(body)))
+                chunks.gaps |= metadata.name == RECOVERED
+                yield metadata
             elif opcode == Opcode.ATTACHMENT:
                 _check_crc(at, body, zlib.crc32(body[:-4]), "an attachment")
                 yield Attachment.read(ReadDataStream(BytesIO(body)))
@@ -125,17 +129,25 @@ def contents(file: IO[bytes]) -> Iterator[list[Raw] | Metadata | Attachment | No
 
 
 class _Chunks:
-    """What the chunks so far have told: schemas, channels, and the next sequence number of each channel."""
+    """What the chunks so far have told: schemas, channels, and the next sequence number of each channel.
+
+    `gaps`: messages may be missing, but their numbers still go up.
+    """
 
     def __init__(self) -> None:
+        self.gaps = False
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._next: dict[int, int] = {}
 
     def messages(self, body: bytes) -> list[Raw]:
         """All messages of a chunk; raises anything when it is not sound, a gap in the numbers included."""
-        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(body))), validate_crc=True)
+        head = ReadDataStream(BytesIO(body))
+        chunk = Chunk.read(head)
+        stream, size = get_chunk_data_stream(chunk)
         data, at, found = stream.read(size), 0, []
+        if head.count != len(body) or zlib.crc32(data) != chunk.uncompressed_crc:  # 0 is no "none": garbage may be 0
+            raise ValueError("the CRC of a chunk is wrong")
         while at < size:
             opcode, length = _HEAD.unpack_from(data, at)
             start, at = at + _HEAD.size, at + _HEAD.size + length
@@ -156,7 +168,8 @@ class _Chunks:
 
     def _message(self, data: bytes, start: int, end: int) -> Raw:
         number, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, start)
-        if sequence != self._next.get(number, sequence):
+        gap = (sequence - self._next.get(number, sequence)) & 0xFFFF_FFFF
+        if gap and not (self.gaps and gap < 1 << 31):
             raise ValueError(f"messages are missing before number {sequence}")
         self._next[number] = (sequence + 1) & 0xFFFF_FFFF
         channel = self._channels[number]

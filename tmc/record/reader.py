@@ -16,7 +16,7 @@ from mcap.records import Attachment, Metadata
 
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
-from tmc.record.frames import MAGIC, DamageError, Raw, contents
+from tmc.record.frames import MAGIC, RECOVERED, DamageError, Raw, contents
 from tmc.record.schemas import message_class
 
 _LOG_NAME = re.compile(rf"(tmc|learner|uav-\d+)\.mcap({re.escape(ACTIVE)})?")
@@ -86,6 +86,12 @@ class Log:
             if isinstance(item, Metadata):
                 found |= item.metadata
         return found
+
+    @property
+    def lost(self) -> dict[str, str]:
+        """What is missing in a file that was recovered from a damaged one (`overfly log recover`); empty otherwise."""
+        found = (item for item in self._items() if isinstance(item, Metadata) and item.name == RECOVERED)
+        return {key: value for item in found for key, value in item.metadata.items()}
 
     def attachments(self) -> list[Attachment]:
         """The files within the file: name, media_type, data."""

@@ -6,6 +6,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tmc.record.frames import RECOVERED
 from tmc.record.reader import Log
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ def copy(old: Path, new: LogWriter) -> None:
     if old.stat().st_size == 0:
         return
     log = Log(old)
+    if log.lost:
+        new.note(RECOVERED, log.lost)
     for attachment in log.attachments():
         new.attach(attachment.name, attachment.media_type, attachment.data)
     for raw in log.raw():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -60,10 +60,13 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         self._last, self._closed = 0, ""
         self._flushed, self._synced = timer(), False
-        old = disk.left_behind(self.path, resume)
-        name = self.active.with_name(self.active.name + ".new") if old else self.active
         try:
-            self._file = name.open("wb" if old else "xb")
+            old = disk.left_behind(self.path, resume)
+            name = self.active.with_name(self.active.name + ".new") if old else self.active
+            with ExitStack() as held:  # nobody else may go on with the old one meanwhile
+                held.enter_context(disk.open_held(old, "rb") if old else nullcontext())
+                self._file = disk.open_held(name, "wb" if old else "xb")
+                self._old = held.pop_all()
         except OSError as error:
             raise RecordError(disk.unwritable(self.path, error)) from None
         self._writer = Writer(self._file, journal.chunk, CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
@@ -82,11 +85,12 @@ class LogWriter:
                 resume.copy(old, self)
             # Names are unique to the process, so that the files of a run can be merged.
             facts = {"format": FORMAT, "process": self.process, "clock": "wall"}
-            self._writer.add_metadata(f"overfly/{self.process}", facts | metadata)
+            self.note(f"overfly/{self.process}", facts | metadata)
             self.flush(fsync=old is not None)
             if old is not None:
                 name.replace(self.active)
                 self.path.unlink(missing_ok=True)
+            self._old.close()
 
     def write(self, topic: str, message: Any, publish_time: int | None = None) -> int:
         """Log a message of the schema that the table has for the topic; gives back its log time.
@@ -140,6 +144,11 @@ class LogWriter:
         with self._guard():
             self._writer.add_attachment(now, now, name, media_type, data)
 
+    def note(self, name: str, facts: dict[str, str]) -> None:
+        """Put metadata into the log."""
+        with self._guard():
+            self._writer.add_metadata(name, facts)
+
     def flush(self, *, fsync: bool = False) -> None:
         """End the chunk and hand it to the system; with `fsync`, also wait until the disk has it (power cuts)."""
         with self._guard():
@@ -161,8 +170,8 @@ class LogWriter:
             self._writer.finish()
             self._file.flush()
             self._sync()
-            self._file.close()
             self.active.rename(self.path)
+            self._file.close()  # and so let go of it, under its new name
         self._closed = f"{self.path} is closed: write before close()"
 
     def __enter__(self) -> Self:
@@ -190,6 +199,7 @@ class LogWriter:
         return RecordError(self._closed)
 
     def _give_up(self) -> None:
+        self._old.close()
         with suppress(OSError):
             self._file.raw.close()
 

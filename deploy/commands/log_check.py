@@ -1,0 +1,100 @@
+"""`overfly log check | recover | seal`: is a log true, what of it can be saved, and how it is kept."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from deploy.progress import PLAIN_EVERY
+from tmc.analysis import check
+from tmc.record.errors import RecordError
+from tmc.record.reader import run_files
+from tmc.record.recover import Recovery, recover
+from tmc.record.seal import seal_run
+from tmc.wire.process import DONE, FAILED
+
+LOSS = 3
+"""Exit code: done, but something is lost."""
+ABOUT = {
+    "check": "replay the TMC's journal and check every invariant of a flight",
+    "recover": "make sound, finished files of what is cut or damaged",
+    "seal": "rewrite a run's logs for keeping: large chunks, finished names",
+}
+VIEWS = tuple(ABOUT)
+
+
+def add_options(view: str, parser: argparse.ArgumentParser) -> None:
+    """Options of one view."""
+    if view == "recover":
+        parser.add_argument("run", type=Path, metavar="RUN", help="run folder, or one MCAP file")
+        where = parser.add_mutually_exclusive_group()
+        where.add_argument("--out", type=Path, metavar="FILE", help="of one file (default: X.recovered.mcap)")
+        where.add_argument("--in-place", action="store_true", help="put the sound file in the place of the other")
+        return
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+
+
+class _Progress:
+    """Says every few seconds what is done, once it has taken two."""
+
+    def __init__(self) -> None:
+        self._tty = sys.stderr.isatty()
+        self._next = time.monotonic() + 2.0
+
+    def __call__(self, what: str, share: float) -> None:
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + (0.5 if self._tty else PLAIN_EVERY)
+            print(f"{what}: {share:.0%}", file=sys.stderr, flush=True)
+
+
+def _check(args: argparse.Namespace) -> int:
+    start = time.monotonic()
+    result = check.check(args.run, _Progress())
+    print("\n".join(result.table()))
+    print(f"\n{result.summary()} in {time.monotonic() - start:.1f} s")
+    return DONE if result.good else FAILED
+
+
+def _recover(args: argparse.Namespace) -> int:
+    if args.out is not None and args.run.is_dir():
+        raise RecordError(f"--out is for one file, and {args.run} is a folder: leave it out, or name the file")
+    try:
+        paths = list(run_files(args.run).values()) if args.run.is_dir() else [args.run]
+    except RecordError as error:
+        return _failed(error)
+    show = _Progress()
+    codes = [_recover_one(path, args, show) for path in paths]
+    return FAILED if FAILED in codes else max(codes)
+
+
+def _recover_one(path: Path, args: argparse.Namespace, show: _Progress) -> int:
+    try:
+        result: Recovery = recover(path, args.out, in_place=args.in_place, show=show)
+    except RecordError as error:
+        return _failed(error)
+    print("\n".join(result.lines()))
+    return DONE if result.clean else LOSS
+
+
+def _failed(error: RecordError) -> int:
+    print(f"overfly: {error}", file=sys.stderr)
+    return FAILED
+
+
+def _seal(args: argparse.Namespace) -> int:
+    try:
+        sealed = seal_run(args.run, _Progress())
+    except RecordError as error:
+        return _failed(error)
+    for file in sealed:
+        torn = f"; a torn end of {file.dropped:,} bytes was dropped" if file.dropped else ""
+        print(f"{file.path}: {file.before:,} bytes before, {file.after:,} after, {file.messages:,} messages{torn}")
+    before, after = sum(f.before for f in sealed), sum(f.after for f in sealed)
+    print(f"{len(sealed)} files: {before:,} bytes before, {after:,} after ({after / before:.0%})")
+    return LOSS if any(file.dropped for file in sealed) else DONE
+
+
+MAINS: dict[str, Callable[[argparse.Namespace], int]] = {"check": _check, "recover": _recover, "seal": _seal}

@@ -1,0 +1,121 @@
+"""`overfly log check | recover | seal` as a user calls them: what they print, and their exit codes."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import main
+from deploy.commands import log_check
+from tmc.record.reader import Log
+from tmc.record.writer import LogWriter
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("check") / "R"
+    assert main(["fly", "planner:greedy", "--lockstep", "--ticks", "60", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(flown: Path, tmp_path: Path) -> Path:
+    """A run folder of one's own."""
+    shutil.copytree(flown, tmp_path / "R", ignore=shutil.ignore_patterns("report"))
+    return tmp_path / "R"
+
+
+def damage(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def test_check_prints_a_line_an_invariant(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["log", "check", str(run)]) == 0
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
+    assert lines[0].split() == ["invariant", "what", "is", "compared", "facts"]
+    assert len(lines) == 23 and all(re.search(r" [\d,]+  (ok|-)$", line) for line in lines[1:21])
+    assert re.fullmatch(rf"{run}/tmc\.mcap: 1 episodes, [\d,]+ facts, all invariants hold in \d+\.\d s", lines[22])
+    assert printed.err == ""
+
+
+def test_check_of_damage_is_exit_code_1(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damage(run / "tmc.mcap")
+    assert main(["log", "check", str(run)]) == 1
+    out = capsys.readouterr().out
+    assert re.search(r"^file .* VIOLATED: tmc\.mcap: .*, at byte \d+$", out, re.MULTILINE)
+
+
+def test_recover_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["log", "recover", str(run)]) == 0
+    assert "sound and finished" in capsys.readouterr().out
+    damage(run / "tmc.mcap")
+    assert main(["log", "recover", str(run)]) == log_check.LOSS
+    out = capsys.readouterr().out
+    assert f"they are in {run / 'tmc.recovered.mcap'}" in out and "lost" in out
+    assert main(["log", "check", str(run)]) == 1  # the original is as it was
+    assert main(["log", "recover", str(run)]) == 1  # the file is there already
+    assert "exists already" in capsys.readouterr().err
+    assert main(["log", "recover", str(run), "--in-place"]) == log_check.LOSS
+    assert Log(run / "tmc.mcap").damage is None
+    assert main(["log", "check", str(run)]) == 1
+    assert "VIOLATED: lost: " in capsys.readouterr().out
+
+
+def test_recover_of_a_file(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = run / "tmc.mcap", tmp_path / "mended.mcap"
+    path.write_bytes(path.read_bytes()[:-2000])
+    assert main(["log", "recover", str(path), "--out", str(out)]) in (0, log_check.LOSS)
+    assert Log(out).finished
+    assert main(["log", "recover", str(tmp_path / "gone.mcap")]) == 1
+    assert main(["log", "recover", str(run / "config.json")]) == 1
+    assert main(["log", "recover", str(run), "--out", str(out)]) == 2
+    err = capsys.readouterr().err.splitlines()
+    assert len(err) == 3 and all(line.startswith("overfly: ") for line in err)
+    with pytest.raises(SystemExit, match="2"):
+        main(["log", "recover", str(path), "--out", "x.mcap", "--in-place"])
+
+
+def test_seal(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "tmc.mcap").rename(run / "tmc.mcap.active")
+    assert main(["log", "seal", str(run)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(rf"{run}/tmc\.mcap: [\d,]+ bytes before, [\d,]+ after, [\d,]+ messages", lines[0])
+    assert re.fullmatch(r"1 files: [\d,]+ bytes before, [\d,]+ after \(\d+%\)", lines[1])
+    assert main(["log", "check", str(run)]) == 0
+    damage(run / "tmc.mcap")
+    capsys.readouterr()
+    assert main(["log", "seal", str(run)]) == 1
+    assert "overfly log recover" in capsys.readouterr().err
+
+
+def test_seal_of_a_run_that_is_alive(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = Log(run / "tmc.mcap").metadata()
+    from tmc.kernel.config import Journal  # noqa: PLC0415
+
+    with LogWriter(run / "learner.mcap", "learner", Journal(), config):
+        assert main(["log", "seal", str(run)]) == 1
+    assert "is being written by another process" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("view", ["check", "recover", "seal"])
+def test_no_run(view: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["log", view, str(tmp_path)]) == (2 if view == "check" else 1)
+    assert "holds no logs of a run" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_takes_long_says_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(log_check.time, "monotonic", lambda: now[0])
+    show = log_check._Progress()
+    for now[0] in (1.0, 1.9, 2.5, 3.0, 8.0):
+        show("reading tmc.mcap", now[0] / 10)
+    assert capsys.readouterr().err.splitlines() == ["reading tmc.mcap: 25%", "reading tmc.mcap: 80%"]
