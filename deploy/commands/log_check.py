@@ -23,7 +23,6 @@ ABOUT = {
     "recover": "make sound, finished files of what is cut or damaged",
     "seal": "rewrite a run's logs for keeping: large chunks, finished names",
 }
-VIEWS = tuple(ABOUT)
 
 
 def add_options(view: str, parser: argparse.ArgumentParser) -> None:
@@ -41,12 +40,12 @@ class _Progress:
     """Says every few seconds what is done, once it has taken two."""
 
     def __init__(self) -> None:
-        self._tty = sys.stderr.isatty()
+        self._every = 2.0 if sys.stderr.isatty() else PLAIN_EVERY
         self._next = time.monotonic() + 2.0
 
     def __call__(self, what: str, share: float) -> None:
         if time.monotonic() >= self._next:
-            self._next = time.monotonic() + (0.5 if self._tty else PLAIN_EVERY)
+            self._next = time.monotonic() + self._every
             print(f"{what}: {share:.0%}", file=sys.stderr, flush=True)
 
 

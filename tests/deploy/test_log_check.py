@@ -40,7 +40,7 @@ def test_check_prints_a_line_an_invariant(run: Path, capsys: pytest.CaptureFixtu
     lines = printed.out.splitlines()
     assert lines[0].split() == ["invariant", "what", "is", "compared", "facts"]
     assert len(lines) == 23 and all(re.search(r" [\d,]+  (ok|-)$", line) for line in lines[1:21])
-    assert re.fullmatch(rf"{run}/tmc\.mcap: 1 episodes, [\d,]+ facts, all invariants hold in \d+\.\d s", lines[22])
+    assert re.fullmatch(rf"{run}/tmc\.mcap: 1 episode, [\d,]+ facts, all invariants hold in \d+\.\d s", lines[22])
     assert printed.err == ""
 
 

@@ -32,7 +32,7 @@ def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(overfly, runn
     assert set(logs) == {"tmc.mcap.active", *(f"uav-00{i}.mcap.active" for i in range(3))}
     checked = overfly("log", "check", out)
     assert checked.returncode == 0, checked.stdout + checked.stderr
-    assert "1 episodes, 1 of them not finished" in checked.stdout and "the file was not closed" in checked.stdout
+    assert "1 episode (1 not finished)" in checked.stdout and "the file was not closed" in checked.stdout
     digest = overfly("log", "digest", out).stdout
     assert overfly("log", "recover", out).returncode in (0, 3)
     for name, messages in logs.items():

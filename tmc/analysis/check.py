@@ -89,8 +89,9 @@ class Result:
         """All of it in one sentence."""
         broken, facts = sum(row.violation is not None for row in self.rows), sum(row.facts for row in self.rows)
         verdict = f"{broken} of {len(self.rows)} invariants are violated" if broken else "all invariants hold"
-        open_ = f", {self.unfinished} of them not finished" if self.unfinished else ""
-        return f"{self.path}: {self.episodes} episodes{open_}, {facts:,} facts, {verdict}{self.note}"
+        open_ = f" ({self.unfinished} not finished)" if self.unfinished else ""
+        count = f"{self.episodes} episode{'s' * (self.episodes != 1)}"
+        return f"{self.path}: {count}{open_}, {facts:,} facts, {verdict}{self.note}"
 
 
 def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) -> Result:
@@ -115,6 +116,8 @@ def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) ->
         result.unfinished += not e.ended
         show(f"checked episode {e.number}", e.number / world.config.training.episodes)
     _judge_file(log, result, notes)
+    if not result.episodes:
+        rows[0].violation = Violation(None, None, None, "there is none: nothing was flown, or nothing of it is left")
     return result
 
 

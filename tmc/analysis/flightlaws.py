@@ -26,13 +26,13 @@ def episodes(e: Evidence) -> Found:
         faults.append((None, None, f"{len(e.begins)} different messages begin it"))
     if len(e.ends) > 1 or not (e.ends or e.last):
         faults.append((None, None, f"{len(e.ends)} messages end it"))
-    faults += [(None, None, "its begin has sums of what was not flown yet") for m in e.begins if _sums_of(m)]
+    faults += [(None, None, "its begin has sums of what was not flown yet") for m in e.begins if not _fresh(e, m)]
     return judged(e, len(e.begins) + len(e.ends), faults)
 
 
-def _sums_of(m: Any) -> bool:
-    blocked = m.blocked_grid + m.blocked_obstacle + m.blocked_uav
-    return bool(m.ticks or m.uncertainty or m.uncertainty_per_cell or blocked or any(m.reward))
+def _fresh(e: Evidence, m: Any) -> bool:
+    sums = (m.ticks, m.uncertainty, m.uncertainty_per_cell, m.blocked_grid, m.blocked_obstacle, m.blocked_uav)
+    return not any(sums) and list(m.reward) == [0.0] * e.N
 
 
 def starts(e: Evidence) -> Found:

@@ -13,8 +13,8 @@ from tmc.record.errors import RecordError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a disk that holds no more."""
-_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
-"""Errors of a file system that knows no locks: there, nothing can be held."""
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
+"""Errors of a file system that knows no locks, or, as NFS, none of files opened to read: there, nothing is held."""
 
 
 def left_behind(path: Path, resume: bool) -> Path | None:

@@ -15,8 +15,9 @@ from tmc.kernel.config import Journal
 from tmc.record import disk, rewrite
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
+from tmc.record.findings import Findings, Item, Show, unseen
 from tmc.record.frames import RECOVERED
-from tmc.record.salvage import Findings, Item, Show, salvage, unseen
+from tmc.record.salvage import salvage
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,9 @@ def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show
         if found.finished and found.whole and not found.notes:
             return Recovery(path, None, found)
         target = finished_name(path) if in_place else out or recovered_name(path)
-        if target != path and target.exists():
-            raise RecordError(f"{target} exists already: choose another --out, or remove it")
+        if target.exists() and not (in_place and target == path):
+            mend = "remove the one that you do not want" if in_place else "choose another --out, or remove it"
+            raise RecordError(f"{target} exists already: {mend}")
         kept = keep if in_place and not found.whole else _nothing
         items = chain(_mark(found), salvage(path, "writing what is sound in", show)[1])
         rewrite.write(target, Journal().chunk, found.profile, items, lambda _new: kept(path))

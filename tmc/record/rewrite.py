@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from tmc.record import disk
 from tmc.record.errors import RecordError
-from tmc.record.salvage import Item
+from tmc.record.findings import Item
 
 
 def write(

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from tmc.record import rewrite
 from tmc.record.errors import RecordError
+from tmc.record.findings import CUT, Findings, Item, Message, Show, unseen
 from tmc.record.reader import run_files
 from tmc.record.recover import finished_name, held
-from tmc.record.salvage import CUT, Findings, Item, Message, Show, salvage, unseen
+from tmc.record.salvage import salvage
 
 CHUNK = 4 * 1024 * 1024
 """Bytes of a chunk before compression: zstd finds more to share in it, and readers find their place by the indexes."""

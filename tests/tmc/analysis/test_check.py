@@ -480,3 +480,8 @@ def test_no_journal(tmp_path: Path) -> None:
     LogWriter(tmp_path / "learner.mcap", "learner", Journal(), {}).close()
     with pytest.raises(RecordError, match=r"holds no tmc\.mcap"):
         check(tmp_path)
+
+
+def test_a_journal_without_a_flight_does_not_pass(fly: Fly, tmp_path: Path) -> None:
+    folder = altered(fly(**CROWD), tmp_path / "empty", lambda _topic, _message: iter(()))
+    assert broken(check(folder)) == {"episodes": "there is none: nothing was flown, or nothing of it is left"}

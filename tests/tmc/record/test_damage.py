@@ -301,6 +301,8 @@ def test_what_cannot_be_recovered_is_said_and_leaves_nothing(wholes: dict[bool, 
     path = write(tmp_path, wholes[True], wholes[True].data[:-700])
     with pytest.raises(RecordError, match="exists already: choose another --out"):
         recover(path, text)
+    with pytest.raises(RecordError, match="exists already: choose another --out"):
+        recover(path, path)
     with pytest.raises(RecordError, match=r"gone/x\.mcap cannot be written \(No such file"):
         recover(path, tmp_path / "gone" / "x.mcap")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty.mcap", "text.mcap", "tmc.mcap"]
