@@ -27,6 +27,10 @@ STINT = 32
 """Ticks that a pilot flies at most before it looks up."""
 
 
+class LostRecordsError(Exception):
+    """The TMC has lost what it had acknowledged; only a new process can take the flight up again."""
+
+
 class Phase(Enum):
     """What the pilot does next, or waits for."""
 
@@ -73,16 +77,19 @@ class Pilot:
         self.policy = self.wanted = 0
         self.explored = self.steps = 0
         self.pending: Record | None = None
+        self.spool: list[Record] = []
+        """Records that the TMC has not acknowledged as journalled for good."""
 
     # Messages in.
 
     def begin(self, begin: Begin) -> PolicyRequest | None:
-        """Start an episode, or take a flight up again where the TMC's last record of it ends."""
-        if self.phase is not Phase.IDLE and begin.episode == self.episode:
+        """Start an episode, or, in a new process, take a flight up again where the TMC's last record of it ends."""
+        if begin.episode <= self.episode:
             return None  # a repeat
         track = begin.track.tolist()
         self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, track[-1], track[-2:][0]
         self.sequence, self.version = begin.sequence, begin.version
+        self.spool = [r for r in self.spool if r.sequence < begin.sequence]
         self.airspace.begin(self.episode, self.world.starts(self.episode))
         for uav in begin.lost.tolist():
             self.airspace.lose(uav)
@@ -103,6 +110,7 @@ class Pilot:
 
     def on_map(self, answer: Map) -> PolicyRequest | None:
         """The TMC's answer to the record of tick t; anything else is old news and dropped."""
+        self.acknowledge(answer.acknowledged)
         if (answer.episode, answer.tick) != (self.episode, self.t) or self.t > self.shipped or self._answered:
             return None
         if self.config.scenario == 1:
@@ -113,6 +121,19 @@ class Pilot:
         self.version, self.pending, self._answered = answer.version, None, True
         # A flight taken up again is answered before it has sensed its peers anew.
         return self._want(answer.policy, Phase.ACT if self.phase is Phase.MAP else Phase.SENSE)
+
+    def acknowledge(self, sequence: int) -> list[Record]:
+        """The TMC has the records below `sequence` for good; returns those of them that were still in the spool."""
+        done = [r for r in self.spool if r.sequence < sequence]
+        self.spool = self.spool[len(done) :]
+        return done
+
+    def missed(self, sequence: int) -> list[Record]:
+        """What to send again to a TMC whose next record of this UAV is `sequence`. Raises LostRecordsError."""
+        again = [r for r in self.spool if r.sequence >= sequence]
+        if len(again) < self.sequence - sequence:
+            raise LostRecordsError(f"the TMC asks for record {sequence}, which it had acknowledged")
+        return again
 
     def _want(self, version: int, then: Phase) -> PolicyRequest | None:
         """A policy reaches a UAV only at an exchange: ask for the one that the TMC names, if it is another."""
@@ -183,6 +204,7 @@ class Pilot:
             np.array(leg.rewards, "<f4"),
             EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
         )  # fmt: skip
+        self.spool.append(self.pending)
         self.sequence += 1
         self.shipped = self.t
         self.leg = Leg(self.t + 1)

@@ -12,12 +12,12 @@ from typing import Any, NoReturn
 import zmq
 
 from actors.airspace import Tracks, Waiting
-from actors.pilot import Phase, Pilot
+from actors.pilot import LostRecordsError, Phase, Pilot
 from actors.planners import PREFIX, Decider, PlannerDecider
 from actors.radio import RadioTracks
 from actors.stalls import Lead, StallingTracks, stalls
 from actors.tracks import TableTracks, open_table
-from actors.witness import Witness
+from actors.witness import Oath, Witness
 from tmc.kernel.config import build
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
@@ -29,8 +29,8 @@ from tmc.wire import messages as m
 from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
 
-SILENCE = 1.0
-"""Seconds after which a message that was not answered goes out again."""
+SILENCE = (0.25, 1.0)
+"""Seconds after which a message that was not answered goes out again: at first, and at most; doubles in between."""
 STATUS_EVERY = 0.5
 """Seconds between two status messages in the log."""
 NAP = 0.02
@@ -59,8 +59,9 @@ class Service:
         self.table: TableTracks | None = None
         self.lead: Lead | None = None
         self.witness: Witness | None = None
-        self._said = time.monotonic()
-        self._reported, self._status_due = (self._said, 0), 0.0
+        self.oath: Oath | None = None
+        self._said, self._silence = time.monotonic(), SILENCE[0]
+        self._reported, self._status_due, self._asked = (self._said, 0), 0.0, 0.0
 
     def fly(self, stop: Callable[[], bool]) -> NoReturn:
         """The main loop; raises Left when the TMC, or a signal, ends it."""
@@ -87,7 +88,7 @@ class Service:
         hello = m.Hello("uav", self.uav, self.life)
         while not stop():
             self.say(hello)
-            if self.sock.poll(int(SILENCE * 1000)):
+            if self.sock.poll(int(SILENCE[0] * 1000)):
                 message = self._receive()
                 if isinstance(message, m.Welcome):
                     return self._make_pilot(message)
@@ -114,6 +115,7 @@ class Service:
             tracks = StallingTracks(tracks, config, self.uav)
         self.lead = Lead() if config.trial.stall else None
         self.witness = witness = Witness(observer) if config.trial.witness else None
+        self.oath = Oath(self.out, self.uav) if config.trial.oath else None
 
         def decider(model: bytes) -> Decider:
             from actors.policy import NetworkDecider  # noqa: PLC0415  planners start without ONNX Runtime
@@ -146,9 +148,11 @@ class Service:
     def _listen(self, patience: float) -> None:
         """Take what has come in; wait up to `patience` seconds for it, and speak again after too long a silence."""
         if not self.sock.poll(int(patience * 1000)):
-            if time.monotonic() - self._said > SILENCE:
+            if time.monotonic() - self._said > self._silence:
+                self._silence = min(2 * self._silence, SILENCE[1])
                 self._repeat()
             return
+        self._silence = SILENCE[0]
         while (message := self._receive()) is not None:
             answer = self._obey(message)
             if answer is not None:
@@ -171,6 +175,7 @@ class Service:
         if isinstance(message, m.Begin):
             return self.pilot.begin(message)
         if isinstance(message, m.Map):
+            self._acknowledged(message.acknowledged)
             return self.pilot.on_map(message)
         if isinstance(message, m.Policy):
             self.pilot.on_policy(message)
@@ -178,17 +183,36 @@ class Service:
             self.pilot.on_lost(message)
         elif isinstance(message, m.Beacon) and self.radio is not None:
             self.radio.hear(message)
+        elif isinstance(message, m.Welcome):
+            self._say_again(message.sequence)
         elif isinstance(message, m.End):
+            self._acknowledged(message.acknowledged)
             raise Left(process.DONE, message.reason)
         elif isinstance(message, m.Error):
             self._on_error(message)
         return None
 
+    def _acknowledged(self, sequence: int) -> None:
+        """The TMC has all records below this one for good."""
+        for record in self.pilot.acknowledge(sequence):
+            if self.oath is not None:
+                self.oath.swear(record)
+
+    def _say_again(self, sequence: int) -> None:
+        """A TMC that was started again asks for what it has not, from record `sequence` on."""
+        try:
+            missed = self.pilot.missed(sequence)
+        except LostRecordsError as lost:
+            raise Left(process.FAILED, f"{lost}: its process must start anew") from None
+        for record in missed:
+            self.say(record)
+
     def _on_error(self, error: m.Error) -> None:
         self._note("ERROR", f"the TMC says: {error.text}")
         if error.code == "fenced":
             raise Left(process.FENCED, error.text)
-        if error.code == "state":  # a TMC that was started again knows nobody
+        if error.code == "state" and time.monotonic() - self._asked > SILENCE[0]:
+            self._asked = time.monotonic()  # a TMC that was started again knows less than it did
             self.say(m.Hello("uav", self.uav, self.life))
         if error.code in {"refused", "version"}:
             raise Left(process.USAGE, f"the TMC refused: {error.text}")

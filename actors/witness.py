@@ -1,12 +1,19 @@
-"""For trials: a witness that takes down a hash of all that a UAV decides by, so that two missions can be compared."""
+"""For trials: what a UAV takes down apart, to be held against the log of the TMC.
+
+A witness takes down a hash of all that the UAV decides by, so that two missions can be compared. An oath takes down
+which of its flight records the TMC has acknowledged, so that one that is not in the journal is found out.
+"""
 
 from __future__ import annotations
 
+import os
 from hashlib import blake2b
+from pathlib import Path
 from typing import Any
 
 from actors.planners import Decider, Sight
 from tmc.kernel.observation import Observer
+from tmc.record.builders import record_digest
 from tmc.record.schemas import Witness as Testimony
 from tmc.wire.messages import Record
 
@@ -52,3 +59,16 @@ class _Watched:
     def choose(self, sight: Sight) -> int:
         self._witness.see(sight)
         return self._decider.choose(sight)
+
+
+class Oath:
+    """A file of its own, in which each line is the number and the digest of a record that was acknowledged."""
+
+    def __init__(self, out: Path, uav: int) -> None:
+        folder = out / "oaths"
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = os.open(folder / f"uav-{uav:03d}.txt", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def swear(self, record: Record) -> None:
+        """The TMC has acknowledged this record; in one write, so that a kill leaves no half of a line."""
+        os.write(self._file, f"{record.sequence} {record_digest(record)}\n".encode())

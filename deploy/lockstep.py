@@ -20,6 +20,7 @@ from tmc.record.channels import uav_topic
 from tmc.record.writer import LogWriter
 from tmc.roster import LEARNER, Outbox, uav_name
 from tmc.station import Station
+from tmc.status import status
 from tmc.wire import messages as m
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class LockStep:
     def _take(self) -> list[tuple[int, m.Message]]:
         outbox = self.station.out.take()
         self.keep(outbox)
+        self.station.committed()  # in one process nothing is lost that another one needs
         self._minibatches += [x for to, x in outbox.sends if to == LEARNER and isinstance(x, m.Minibatch)]
         return [(int(to.removeprefix("uav-")), x) for to, x in outbox.sends if to.startswith("uav-")]
 
@@ -93,7 +95,7 @@ class LockStep:
                 self.fleet.deliver(uav, reply)
         while self.fleet.step() | self._learn():
             if show is not None:
-                show(self.station.status())
+                show(status(self.station))
 
     def _learn(self) -> bool:
         """Train on every minibatch that the limiter lets through; True when there was one."""

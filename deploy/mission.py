@@ -18,10 +18,12 @@ from actors.tracks import create_table
 from deploy import lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
-from tmc.kernel.config import Config, ConfigError, flat
+from tmc.journal import journal_in
+from tmc.kernel.config import Config, ConfigError, build, flat
 from tmc.kernel.policy import check_view, view_shape
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
+from tmc.record import disk
 from tmc.wire import process
 
 POLL = 0.1
@@ -67,6 +69,27 @@ def check(config: Config, policy: bytes | None = None) -> World:
     return world
 
 
+def flown_policy(out: Path) -> Path:
+    """The fixed policy of a run that flies one."""
+    return out / "policies" / "flown.onnx"
+
+
+def interrupted(out: Path) -> tuple[World, bytes | None]:
+    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError."""
+    journal = journal_in(out)
+    if journal is None:
+        raise ConfigError(f"{out} holds no journal (tmc.mcap): --resume takes the folder of a run that was begun")
+    try:
+        values = json.loads((out / "config.json").read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{out / 'config.json'} cannot be read ({error}): the run cannot go on without it") from None
+    with disk.open_held(journal, "rb"):
+        pass  # nobody writes it
+    file = flown_policy(out)
+    policy = file.read_bytes() if file.exists() else None
+    return check(build(values), policy), policy
+
+
 class Mission:
     """One mission in its run folder; `world` comes from `check`."""
 
@@ -77,7 +100,7 @@ class Mission:
         self.world, self.config, self.out, self.command = world, config, out, command
         self.policy: Path | None = None
         if policy is not None:
-            self.policy = out / "policies" / "flown.onnx"
+            self.policy = flown_policy(out)
             self.policy.parent.mkdir(parents=True, exist_ok=True)
             self.policy.write_bytes(policy)
         (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")

@@ -50,10 +50,10 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
     endpoint, tracks = f"ipc://{scratch}/sync", scratch / "tracks"
     flies_fixed = policy is not None or config.team.pilot != "policy"
     common = ("--parent", str(os.getpid()), "--out", str(out))
-    tmc = [*_module("tmc"), "--config", str(out / "config.json"), "--bind", endpoint, *common]
+    tmc = [*_module("tmc"), "--config", str(out / "config.json"), "--bind", endpoint, "--resume", *common]
     tmc += ["--tracks", str(tracks)] if table else []
     tmc += ["--policy", str(policy)] if policy else []
-    children = [Child("tmc", tuple(tmc), restart=False, leads=True)]
+    children = [Child("tmc", tuple(tmc), restart=True, leads=True)]
     if not flies_fixed:
         children.append(Child("learner", (*_module("learner"), "--connect", endpoint, *common), restart=True))
     for i in range(config.team.size):

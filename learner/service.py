@@ -24,7 +24,7 @@ from tmc.wire.sockets import EndpointError
 
 WINDOW = 2
 """Minibatch requests in flight, so that the learner never waits for the way there and back."""
-SILENCE = 5.0
+SILENCE = 1.0
 """Seconds without a minibatch after which the learner says hello again: the TMC may have been started anew."""
 METRICS_EVERY = 0.2
 """Seconds between two metrics messages in the log."""
@@ -122,6 +122,8 @@ class Service:
             self._ask()
             self._update(message)
         elif isinstance(message, m.Welcome):  # a TMC that has lost our requests
+            self.trainer.version = max(self.trainer.version, message.policy)
+            self._push()
             for _ in range(WINDOW):
                 self._ask()
         elif isinstance(message, m.Error) and self.log is not None:

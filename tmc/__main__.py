@@ -5,14 +5,18 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 import uuid
 from pathlib import Path
 
-from tmc.journal import Journal
+from tmc.journal import Journal, journal_in
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.roadmap import MapError
 from tmc.kernel.world import World
 from tmc.record.errors import RecordError
+from tmc.record.reader import Log
+from tmc.recovery import recover
+from tmc.roster import Outbox
 from tmc.service import Service
 from tmc.station import Station
 from tmc.wire import process
@@ -21,19 +25,48 @@ from tmc.wire.sockets import EndpointError
 MISTAKES = (ConfigError, MapError, RecordError, EndpointError)
 
 
-def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, tracks: str) -> int:
-    """Run the TMC of a mission until it is over; returns the exit code. With a fixed policy there is no learner."""
+def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, tracks: str, resume: bool = False) -> int:
+    """Run the TMC of a mission until it is over; returns the exit code. With a fixed policy there is no learner.
+
+    `resume`: go on with the journal in `out`, if there is one.
+    """
     stop = process.Stop()
     world = World(config)
-    run = uuid.uuid4().hex[:12]
+    run = (run_of(out, config) if resume else None) or uuid.uuid4().hex[:12]
     learning = policy is None and config.team.pilot == "policy"
     station = Station(world, run, learning=learning, policy=policy.read_bytes() if policy else None, tracks=tracks)
     out.mkdir(parents=True, exist_ok=True)
-    service = Service(station, Journal(out, world, run), endpoint)
+    journal = Journal(out, world, run, resume=resume)
+    if journal.found:
+        take_up(station, journal)
+    service = Service(station, journal, endpoint)
     try:
         return process.DONE if service.serve(stop) else stop.code
     finally:
         service.close()
+
+
+def run_of(out: Path, config: Config) -> str | None:
+    """The run whose journal lies in `out`, None when there is none; ConfigError if it has other settings."""
+    found = journal_in(out)
+    if found is None:
+        return None
+    log = Log(found)
+    was = next((json.loads(a.data) for a in log.attachments() if a.name == "config.json"), None)
+    if was is not None and build(was) != config:
+        raise ConfigError(f"{out} holds the journal of a mission with other settings: choose another --out")
+    return log.metadata().get("run")
+
+
+def take_up(station: Station, journal: Journal) -> None:
+    """Play the journal that an earlier life left, and write what is missing in it."""
+    start = time.monotonic()
+    missing = recover(station, journal.writer.active, start)
+    journal.take(Outbox(entries=missing))
+    journal.commit()
+    seconds, flight = time.monotonic() - start, station.flight
+    where = f"tick {flight.done} of episode {flight.episode}" if flight else f"the end of episode {station.episodes}"
+    journal.writer.log("warning", f"the TMC was started again and goes on from {where}; recovery took {seconds:.2f} s")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -44,13 +77,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="run folder")
     parser.add_argument("--policy", type=Path, help="fly this policy file; there is no learner")
     parser.add_argument("--tracks", default="", help="track table that UAVs on this machine share")
+    parser.add_argument("--resume", action="store_true", help="go on with the journal in the run folder")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args(argv)
     process.die_with_parent(a.parent)
 
     def start() -> int:
         config = build(json.loads(a.config.read_text()))
-        return serve(config, a.bind, a.out, policy=a.policy, tracks=a.tracks)
+        return serve(config, a.bind, a.out, policy=a.policy, tracks=a.tracks, resume=a.resume)
 
     return process.run(start, MISTAKES)
 

@@ -11,6 +11,7 @@ import numpy as np
 from tmc.flight import Exchange, Flight, Truth
 from tmc.kernel.reward import Block
 from tmc.record.channels import uav_topic
+from tmc.replay import Replay
 from tmc.wire.messages import Record
 
 
@@ -53,6 +54,17 @@ def truth(flight: Flight, fresh: Truth, steps: int, updates: int, policy: int) -
         values = {"episode": flight.episode, "ticks": list(ticks), "cells": list(cells)}
         entries.append(Entry("/tmc/events", values))
     return entries
+
+
+def lost(flight: Flight, uav: int) -> Entry:
+    """A UAV that the team goes on without."""
+    return Entry("/tmc/lost", {"episode": flight.episode, "uav": uav, "tick": flight.lost[uav]})
+
+
+def state(flight: Flight, replay: Replay) -> Entry:
+    """What the TMC holds at the end of an episode: digests that whoever plays the journal must get as well."""
+    values = {"episode": flight.episode, "map": flight.digest(), "replay": replay.digest(), "transitions": len(replay)}
+    return Entry("/tmc/state", values)
 
 
 def episode(flight: Flight, phase: str, epsilon: float, steps: int, updates: int) -> Entry:

@@ -18,7 +18,7 @@ class Feed:
     def __init__(self, replay: Replay, limiter: Limiter, batch: int) -> None:
         self.replay, self.limiter, self.batch = replay, limiter, batch
         self.life = -1
-        self.told_the_end = False
+        self.told_the_end = self.recovered = False
         self._requests: list[int] = []
 
     def welcome(self, hello: Hello) -> None:
@@ -26,7 +26,9 @@ class Feed:
         self._requests.clear()  # it asks again once it is welcome
         if hello.life != self.life:
             self.life, self.told_the_end = hello.life, False
-            self.limiter.updates = min(self.limiter.updates, hello.updates)
+            # A TMC that was started again knows how far the learner was a moment ago; the learner knows how far it is.
+            self.limiter.updates = hello.updates if self.recovered else min(self.limiter.updates, hello.updates)
+            self.recovered = False
 
     def ask(self, request: int) -> bool:
         """Take a request; False when too many are in flight already."""

@@ -7,6 +7,7 @@ slowest UAV: only when all have reported a tick are its visits, rewards and unce
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,10 +201,10 @@ class Flight:
             if k >= 0 and believed[k] < tick:
                 believed[k] = tick
 
-    def answer(self, exchange: Exchange, policy: int, sequence: int) -> Map:
-        """The TMC's answer at an exchange; `sequence`: the record that it answers."""
+    def answer(self, exchange: Exchange, policy: int, sequence: int, acknowledged: int) -> Map:
+        """The TMC's answer at an exchange to record `sequence`; those below `acknowledged` are journalled for good."""
         last_visit, active = exchange.last_visit, exchange.active
-        return Map(self.episode, exchange.tick, exchange.version, policy, sequence, last_visit, active)
+        return Map(self.episode, exchange.tick, exchange.version, policy, sequence, acknowledged, last_visit, active)
 
     def begin(self, i: int, policy: int, sequence: int) -> Begin:
         """Fly from the last record that the TMC has of UAV i; at the start of the episode, from its beginning."""
@@ -232,6 +233,11 @@ class Flight:
         last = self.lost[uav] = self.reported[uav]
         self.cells[last + 1 :, uav] = GONE
         return last
+
+    def digest(self) -> str:
+        """BLAKE2b, hex, of the global map: the true one, the one that the TMC believes, and what each UAV believes."""
+        maps = (self.last_visit, self.active, self.believed, self.beliefs)
+        return hashlib.blake2b(b"".join(a.tobytes() for a in maps), digest_size=16).hexdigest()
 
     def present(self, t: int) -> list[tuple[int, int]]:
         """(uav, cell) of those who were not lost at tick t."""

@@ -1,9 +1,14 @@
-"""Writes what the station wants journalled into the TMC's MCAP file."""
+"""Writes what the station wants journalled into the TMC's MCAP file, and commits it a group at a time.
+
+What is committed survives what `journal.durability` says. Policy files are too large for a journal of thousands of
+them: those still in use lie beside it, in `policies/`, and the journal has their digests.
+"""
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +16,7 @@ from tmc.entries import Entry
 from tmc.kernel.config import flat
 from tmc.kernel.world import World
 from tmc.record import builders
-from tmc.record.channels import CHANNELS
+from tmc.record.channels import ACTIVE, CHANNELS
 from tmc.record.schemas import message_class
 from tmc.record.writer import LogWriter
 from tmc.roster import Outbox
@@ -20,11 +25,21 @@ _SCHEMA = {c.topic: c.schema for c in CHANNELS}
 
 
 class Journal:
-    """The file `tmc.mcap` of a run: config and map as attachments, then one message an entry."""
+    """The file `tmc.mcap` of a run: config and map as attachments, then one message an entry.
 
-    def __init__(self, folder: Path, world: World, run: str) -> None:
-        self.world = world
-        self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run})
+    `resume`: go on with the journal that an earlier life of the TMC left in the folder, if it left one (`found`).
+    """
+
+    def __init__(self, folder: Path, world: World, run: str, *, resume: bool = False) -> None:
+        self.world, self.folder = world, folder
+        self.found = resume and journal_in(folder) is not None
+        self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run}, resume=resume)
+        self._policies: set[int] = set()
+        self._since: float | None = None
+        if not self.found:
+            self._begin(world)
+
+    def _begin(self, world: World) -> None:
         config = json.dumps(flat(world.config), indent=1)
         self.writer.attach("config.json", "application/json", config.encode())
         self.writer.attach("map.csv", "text/csv", world.map.csv().encode())
@@ -34,10 +49,36 @@ class Journal:
 
     def take(self, outbox: Outbox) -> None:
         """Write the entries and notes of an outbox."""
+        if outbox.entries and self._since is None:
+            self._since = time.monotonic()
         for entry in outbox.entries:
             self.writer.write(entry.topic, self._message(entry))
         for level, text in outbox.notes:
             self.writer.log(level.lower(), text)
+
+    @property
+    def due(self) -> float | None:
+        """Seconds until the entries that are not committed must be; None when all are."""
+        if self._since is None:
+            return None
+        return max(0.0, self._since + self.world.config.journal.commit - time.monotonic())
+
+    def commit(self) -> None:
+        """Hand over all entries so far: to the system, or to the disk."""
+        self.writer.flush(fsync=self.world.config.journal.durability == "power")
+        self._since = None
+
+    def keep_policies(self, held: Mapping[int, bytes]) -> None:
+        """Make the folder `policies` hold these files, and none of those that it held before."""
+        for version in held.keys() - self._policies:
+            path = policy_path(self.folder, version)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            new = path.with_suffix(".new")
+            new.write_bytes(held[version])
+            new.replace(path)
+        for version in self._policies - held.keys():
+            policy_path(self.folder, version).unlink(missing_ok=True)
+        self._policies = set(held)
 
     def _message(self, entry: Entry) -> Any:
         if "record" in entry.values:
@@ -46,6 +87,17 @@ class Journal:
             grid, cell = self.world.grid, self.world.map.cell_m
             return builders.grid(entry.values["last_visit"], grid.rows, grid.cols, cell, time.time_ns())
         return message_class(_SCHEMA[entry.topic])(**entry.values)
+
+
+def journal_in(folder: Path) -> Path | None:
+    """The journal in a run folder, finished or left behind; None when there is none, or an empty file."""
+    paths = (folder / f"tmc.mcap{ACTIVE}", folder / "tmc.mcap")
+    return next((path for path in paths if path.is_file() and path.stat().st_size), None)
+
+
+def policy_path(folder: Path, version: int) -> Path:
+    """Where the TMC keeps the policy with this version while a UAV may ask for it."""
+    return folder / "policies" / f"policy-{version}.onnx"
 
 
 def roads_geojson(world: World) -> str:

@@ -15,11 +15,15 @@ class Policies:
     def __len__(self) -> int:
         return len(self._models)
 
+    def held(self) -> dict[int, bytes]:
+        """The policy files held, by version."""
+        return dict(self._models)
+
     def take(self, version: int, model: bytes, named: Iterable[int]) -> None:
         """Hold a newer policy; of the others only those that were `named` to somebody."""
         self.newest = version
         wanted = {version, *named}
-        self._models = {v: p for v, p in (self._models | {version: model}).items() if v in wanted}
+        self._models = {v: p for v, p in (self._models | {version: model}).items() if v in wanted and p}
 
     def find(self, version: int) -> tuple[int, bytes] | None:
         """The policy with this version; the newest in its place when it was superseded since it was named."""

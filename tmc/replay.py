@@ -7,6 +7,7 @@ since (Sec. II-D). So a transition costs about 11 bytes and its share of a frame
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,6 +120,18 @@ class Replay:
         oldest = int(self.episode[np.array(max(0, self.rows_in - len(self.tick.data)))])
         for gone in [e for e in self._factors if e < oldest]:
             del self._factors[gone]
+
+    def digest(self) -> str:
+        """BLAKE2b, hex, of every transition that can be drawn and of the maps behind them, whatever their numbers."""
+        held = min(self.starts_in, self._starts_kept)
+        place = np.arange(self.starts_in - held, self.starts_in)
+        start, end = self.starts[place], self.ends[place]
+        row = np.arange(start[0] if held else self.rows_in, self.rows_in)
+        base = self.base[row]
+        frame = np.arange(base.min() if held else self.frames_in, self.frames_in)
+        parts = [start - row[:1], end - row[:1], base - frame[:1], self.frames[frame], self.frame_tick[frame]]
+        parts += [ring[row] for ring in (self.cells, self.actions, self.rewards, self.tick, self.episode)]
+        return hashlib.blake2b(b"".join(p.tobytes() for p in parts), digest_size=16).hexdigest()
 
     def sample(self, number: int, batch: int) -> Sample:
         """Minibatch `number` (which addresses the draws), uniform over all transitions held."""

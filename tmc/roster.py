@@ -32,14 +32,31 @@ class Outbox:
 
 @dataclass
 class Member:
-    """A UAV on the roster: its process's life, the lives before it, when it was last heard of, its last answer."""
+    """A UAV on the roster: its process's life, the lives before it, when it was last heard of, its last answer.
+
+    `sequence`: of its next record; `durable`: its records below this number are in the journal for good.
+    """
 
     life: int = -1
     past: set[int] = field(default_factory=set)
     heard: float = 0.0
     sequence: int = 0
+    durable: int = 0
     answer: m.Map | None = None
     named: bool = False
+
+    def live(self, life: int, now: float) -> bool:
+        """Heard at `now` of the process `life`; True when it takes the place of another one."""
+        new = self.life not in {-1, life}
+        if new:
+            self.past.add(self.life)
+        self.life, self.heard, self.named = life, now, False
+        return new
+
+
+def away(members: list[Member]) -> list[int]:
+    """UAVs without a process."""
+    return [i for i, member in enumerate(members) if member.life < 0]
 
 
 def name_some(names: list[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -41,10 +42,11 @@ class Service:
         for sock in (self.sync, self.feed):
             poller.register(sock, zmq.POLLIN)
         while not stop():
-            for sock, _ in poller.poll(100):
+            for sock, _ in poller.poll(self._patience()):
                 self._drain(sock)
             self.station.tick(time.monotonic())
             self._post(self.station.out.take())
+            self._commit()
             self.journal.writer.maybe_flush()
             if self._finished():
                 self._sum_up()
@@ -52,6 +54,18 @@ class Service:
         self._say_goodbye("the TMC was stopped")
         self._sum_up()
         return False
+
+    def _patience(self) -> int:
+        """Milliseconds to wait for a message."""
+        due = self.journal.due
+        return 100 if due is None else math.ceil(1000 * due)
+
+    def _commit(self) -> None:
+        """A group commit, when one is due; only then are records acknowledged, with the answers to later ones."""
+        if self.journal.due == 0.0 or (self.journal.due is not None and self.station.phase == "done"):
+            self.journal.commit()
+            self.station.committed()
+            self._post(self.station.out.take())
 
     def _drain(self, sock: zmq.Socket[Any]) -> None:
         for _ in range(BURST):
@@ -78,12 +92,14 @@ class Service:
         self.station.handle(sender, message, time.monotonic())
 
     def _post(self, outbox: Outbox) -> None:
-        """Journal first, then send: what is not in the journal did not happen."""
+        """Journal first, then send."""
+        if outbox.entries and self.station.learning:
+            self.journal.keep_policies(self.station.policies.held())
         self.journal.take(outbox)
         for name, message in outbox.sends:
-            if name in self._where:
-                sock, identity = self._where[name]
-                sockets.send(sock, message, identity)
+            # Who was not heard yet may have been connected to an earlier life of this process.
+            sock, identity = self._where.get(name) or (self.feed if name == LEARNER else self.sync, name.encode())
+            sockets.send(sock, message, identity)
 
     def _finished(self) -> bool:
         """Over, and everybody has left or was given time to."""

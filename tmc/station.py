@@ -21,7 +21,10 @@ from tmc.limiter import Limiter
 from tmc.policies import Policies
 from tmc.replay import Replay
 from tmc.roster import LEARNER, Member, Outbox, uav_name
+from tmc.status import status
 from tmc.wire import messages as m
+
+GOODBYE = "the mission is over"
 
 
 class Station:
@@ -40,16 +43,16 @@ class Station:
         self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
         self.roster = [Member() for _ in range(config.team.size)]
         self.flight: Flight | None = None
-        self.version = self.ticks = self.steps = self.episodes = self.rejected = 0
-        self.blocked = self.blocked_by_uav = 0
+        self.version = self.ticks = self.steps = self.episodes = self.rejected = self.blocked = self.blocked_by_uav = 0
         self.uncertainty = self.episode_uncertainty = self.loss = 0.0
         self.policies = Policies()
+        self.playing = False  # a journal (tmc.recovery): then episodes begin where it says so
         self.feed = Feed(self.replay, self.limiter, config.dqn.batch)
         self.out = Outbox()
         self._held: list[tuple[str, m.Message]] = []
         self._ended = False
         if policy is not None:
-            self._take_policy(1, policy, 0, 0.0)
+            self.take_policy(1, policy, 0, 0.0)
 
     # What the world sees of it.
 
@@ -62,28 +65,15 @@ class Station:
             return "gathering"
         return "learning" if self.limiter.owed else "done"
 
-    def status(self) -> m.Status:
-        """Progress, for whoever asks."""
-        flight = self.flight
-        return m.Status(
-            self.phase, flight.episode if flight else self.episodes, max(flight.done, 0) if flight else 0, self.ticks,
-            self.limiter.updates, self.policies.newest, self.loss, self.uncertainty, self.episode_uncertainty,
-            self.blocked, self.rejected, roster.name_some(self.waiting_for()),
-        )  # fmt: skip
-
     def waiting_for(self) -> list[str]:
         """Who keeps the mission from going on: processes not here yet, or UAVs whose record is due next."""
         if self.flight is None:
             if self.phase != "gathering":
                 return []
-            missing = [uav_name(i) for i in self._away()]
+            missing = [uav_name(i) for i in roster.away(self.roster)]
             return missing + ([LEARNER] if self.learning and not self.policies.newest else [])
         flight, t = self.flight, self.flight.next_exchange
         return [uav_name(i) for i in flight.due(t) if flight.reported[i] < t]
-
-    def _away(self) -> list[int]:
-        """UAVs without a process."""
-        return [i for i, member in enumerate(self.roster) if member.life < 0]
 
     # Messages in.
 
@@ -105,7 +95,8 @@ class Station:
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))
-        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks, self.policies.newest)
+        number = self.roster[hello.uav].sequence if 0 <= hello.uav < len(self.roster) else 0
+        welcome = m.Welcome(config, self.world.map.fingerprint, self.run, self.tracks, self.policies.newest, number)
         if hello.role == "learner":
             if not self.learning or sender != LEARNER:
                 self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
@@ -118,14 +109,11 @@ class Station:
         if problem is not None:
             self.reject(sender, *problem)
             return
-        member = self.roster[hello.uav]
-        if member.life not in {-1, hello.life}:
-            member.past.add(member.life)
+        if self.roster[hello.uav].live(hello.life, now):
             self.out.notes.append(("WARNING", f"{sender} is back with a new process"))
-        member.life, member.heard, member.named = hello.life, now, False
         self._send(sender, welcome)
-        if self.phase == "done" or self._ended:
-            self._send(sender, m.End("the mission is over"))
+        if self._ended:
+            self._send(sender, m.End(GOODBYE, self.roster[hello.uav].durable))
         elif self.flight is not None:
             if hello.uav not in self.flight.lost:  # who was lost is back with the next episode
                 self._resume(hello.uav)
@@ -150,15 +138,18 @@ class Station:
             self.reject(sender, "state", f"record {record.sequence} of {sender} is not the next one")
             return
         try:
-            flight.accept(record)
+            self.accept(flight, record)
         except RefusedError as refused:
             self.reject(sender, "refused", str(refused))
-            return
-        member.sequence += 1
-        self.out.entries.append(entries.flight_record(record))
-        self._go_on(flight)
 
-    def _go_on(self, flight: Flight) -> None:
+    def accept(self, flight: Flight, record: m.Record) -> None:
+        """Take a UAV's next record, and all that follows from it; raises RefusedError, and changes nothing."""
+        flight.accept(record)
+        self.roster[record.uav].sequence += 1
+        self.out.entries.append(entries.flight_record(record))
+        self.go_on(flight)
+
+    def go_on(self, flight: Flight) -> None:
         """Answer the exchanges that can be held, journal what became final, and end the episode when it is over."""
         for exchange in flight.exchanges():
             self._answer(flight, exchange)
@@ -172,7 +163,8 @@ class Station:
         self.version = exchange.version
         self.out.entries += entries.exchange(flight, exchange, self.policies.newest)
         for i in exchange.uavs:
-            answer = flight.answer(exchange, self.policies.newest, self.roster[i].sequence - 1)
+            member = self.roster[i]
+            answer = flight.answer(exchange, self.policies.newest, member.sequence - 1, member.durable)
             self._held.append((uav_name(i), answer))
 
     def _journal_truth(self, flight: Flight, truth: Truth) -> None:
@@ -190,16 +182,16 @@ class Station:
 
     def _try_begin(self) -> None:
         if self.phase == "gathering" and not self.waiting_for():
-            self._begin_episode()
+            self.begin_episode(roster.away(self.roster))
 
-    def _begin_episode(self) -> None:
-        episode = self.episodes + 1
-        if all(member.life < 0 for member in self.roster):
-            return  # all are lost: gather again
-        self.flight = flight = Flight(self.world, self.reward, self.replay, episode, self.version)
-        for i in self._away():
-            flight.lose(i)
+    def begin_episode(self, away: list[int]) -> None:
+        """The next episode, which those who are `away` have no part in; nothing when everybody is."""
+        if len(away) == len(self.roster):
+            return  # gather again
+        self.flight = flight = Flight(self.world, self.reward, self.replay, self.episodes + 1, self.version)
         self._journal_episode(flight, "begin")
+        for i in away:
+            self.lose(flight, i)
         for i, member in enumerate(self.roster):
             member.answer = None
             self._held.append((uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence)))
@@ -218,9 +210,10 @@ class Station:
         self.blocked_by_uav += flight.blocked[Block.UAV]
         self.episode_uncertainty = flight.total_uncertainty / flight.T
         self._journal_episode(flight, "end")
+        self.out.entries.append(entries.state(flight, self.replay))
         self.flight = None
-        if self.episodes < self.config.training.episodes:
-            self._begin_episode()
+        if self.episodes < self.config.training.episodes and not self.playing:
+            self.begin_episode(roster.away(self.roster))
         else:
             self._finish_if_done()
 
@@ -229,17 +222,22 @@ class Station:
         self.out.entries.append(entries.episode(flight, phase, epsilon, self.steps, self.limiter.updates))
 
     def _finish_if_done(self) -> None:
-        """Send everybody home once the last episode is over and the learner has caught up."""
-        if self.phase != "done":
+        """Send everybody home once the last episode is over and journalled, and the learner has caught up."""
+        if self.phase != "done" or any(member.durable < member.sequence for member in self.roster):
             return
-        goodbye = m.End("the mission is over")
         if self.learning and not self.feed.told_the_end:
             self.feed.told_the_end = True
-            self._send(LEARNER, goodbye)
+            self._send(LEARNER, m.End(GOODBYE))
         if not self._ended:
             self._ended = True
-            self._held += [(uav_name(i), goodbye) for i in range(len(self.roster))]
+            self._held += [(uav_name(i), m.End(GOODBYE, uav.durable)) for i, uav in enumerate(self.roster)]
             self._release()
+
+    def committed(self) -> None:
+        """Everything journalled so far is as safe as `journal.durability` says: it may be acknowledged."""
+        for member in self.roster:
+            member.durable = member.sequence
+        self._finish_if_done()
 
     # Answers held back by the limiter.
 
@@ -273,11 +271,12 @@ class Station:
         if push.version <= self.policies.newest:
             self.reject(sender, "refused", f"policy {push.version} is not newer than {self.policies.newest}")
             return
-        self._take_policy(push.version, push.model, push.updates, push.loss)
+        self.take_policy(push.version, push.model, push.updates, push.loss)
         self._send(sender, m.Ack(push.version))
         self._try_begin()
 
-    def _take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
+    def take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
+        """A newer policy is here, or, when a journal is played, was: `model` is empty where the file is gone."""
         answers = (member.answer for member in self.roster)
         named = [a.policy for a in (*answers, *(x for _, x in self._held)) if isinstance(a, m.Map | m.Begin)]
         self.policies.take(version, model, named)
@@ -308,7 +307,7 @@ class Station:
                 member.heard, member.named = now, False
 
     def _status_request(self, sender: str, _request: m.StatusRequest, _now: float) -> None:
-        self._send(sender, self.status())
+        self._send(sender, status(self))
 
     def _bye(self, sender: str, bye: m.Bye, _now: float) -> None:
         if bye.reason:
@@ -324,16 +323,18 @@ class Station:
             self.out.notes.append(("WARNING", f"{uav_name(i)} {text}"))
         for i in roster.long_silent(self.roster, now, self.config.comms.lost_after):
             if self.flight is flight:  # else the first of them ended the episode
-                self._lose(flight, i)
+                self.lose(flight, i)
+                self.go_on(flight)
 
-    def _lose(self, flight: Flight, i: int) -> None:
+    def lose(self, flight: Flight, i: int) -> None:
+        """Go on without a UAV for the rest of the episode."""
         self.roster[i].life = -1  # whoever comes back says hello first
         last = flight.lose(i)
+        self.out.entries.append(entries.lost(flight, i))
         text = f"{uav_name(i)} is lost after tick {last} of episode {flight.episode}; the others go on without it"
         self.out.notes.append(("ERROR", text))
         for j in range(flight.N):
             self._send(uav_name(j), m.Lost(flight.episode, i, last))
-        self._go_on(flight)
 
 
 _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {

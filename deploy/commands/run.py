@@ -7,11 +7,13 @@ from pathlib import Path
 
 from deploy import mission, settings
 from deploy.commands.analyze import report
+from tmc.kernel.config import ConfigError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("preset", help=f"one of {', '.join(settings.preset_names())}")
+    parser.add_argument("preset", nargs="?", help=f"one of {', '.join(settings.preset_names())}")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with a run or flight that was interrupted")
     settings.add_options(parser)
     add_mission_options(parser)
 
@@ -25,8 +27,21 @@ def add_mission_options(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Train, then say what came of it."""
+    if args.resume is not None:
+        return resume(args)
+    if args.preset is None:
+        raise ConfigError(f"which preset? choose {', '.join(settings.preset_names())}, or --resume RUN")
     config = settings.config_for(args.preset, settings.chosen(args))
     world = mission.check(config)
     out = mission.new_folder(args.out, args.preset)
     code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
     return code or report(out, as_json=args.json)
+
+
+def resume(args: argparse.Namespace) -> int:
+    """Go on with a run from its journal and its checkpoint, whatever was killed."""
+    if args.preset or args.out or args.lockstep or settings.chosen(args):
+        raise ConfigError("--resume goes on with the run's own settings, as processes: give it nothing but --json")
+    world, policy = mission.interrupted(args.resume)
+    code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)
+    return code or report(args.resume, as_json=args.json)

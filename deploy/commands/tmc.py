@@ -8,7 +8,7 @@ from pathlib import Path
 
 from deploy import mission, settings, who
 from tmc.__main__ import serve
-from tmc.kernel.config import build, flat
+from tmc.kernel.config import ConfigError, build, flat
 from tmc.wire.sockets import check_free
 
 
@@ -19,12 +19,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="for UAVs; the learner uses the next port (default: %(default)s)")  # fmt: skip
     parser.add_argument("--fly", metavar="WHO", help="fly a fixed policy or a planner; there is no learner")
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder; runs/tmc-<time> when left out")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with the mission whose journal is there")
     settings.add_options(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Serve until the mission is over."""
     check_free(args.bind)
+    if args.resume is not None:
+        return resume(args)
     config = settings.config_for(args.preset, settings.chosen(args))
     policy = None
     if args.fly:
@@ -48,3 +51,13 @@ def main(args: argparse.Namespace) -> int:
         path.write_bytes(policy)
     print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
     return serve(config, args.bind, out, policy=path, tracks="")
+
+
+def resume(args: argparse.Namespace) -> int:
+    """Serve on where an earlier TMC was stopped or killed; its UAVs and learner find it by themselves."""
+    if args.out or args.fly or settings.chosen(args):
+        raise ConfigError("--resume goes on with the mission's own settings: give it nothing but --bind")
+    world, policy = mission.interrupted(args.resume)
+    path = mission.flown_policy(args.resume) if policy is not None else None
+    print(f"overfly: the TMC is at {args.bind} again, with the journal in {args.resume}", flush=True)
+    return serve(world.config, args.bind, args.resume, policy=path, tracks="", resume=True)

@@ -76,7 +76,7 @@ def begin(world: World, episode: int, *track: int, **fields: Any) -> Begin:
 
 def answer(world: World, episode: int, tick: int, **fields: Any) -> Map:
     last_visit = np.zeros(world.law.cells.size, "<u2") if world.config.scenario == 2 else EMPTY
-    values = {"version": 1, "policy": 0, "sequence": 0, "last_visit": last_visit, "active": EMPTY}
+    values = {"version": 1, "policy": 0, "sequence": 0, "acknowledged": 0, "last_visit": last_visit, "active": EMPTY}
     return Map(episode=episode, tick=tick, **{**values, **fields})
 
 
@@ -212,7 +212,7 @@ def test_a_repeated_begin_changes_nothing(team: Callable[..., Team]) -> None:
 def test_a_flight_is_taken_up_where_the_last_record_ends(team: Callable[..., Team]) -> None:
     made = team(STREET, [0], [[W_, E_, STAY, STAY]], **{"comms.period": 2, "training.ticks": 6})
     pilot = made.pilots[0]
-    pilot.phase = Phase.IDLE  # a new process knows nothing
+    pilot.phase, pilot.episode = Phase.IDLE, 0  # a new process knows nothing
     known = np.array([0, 1, 2, 0], "<u2")
     begun = begin(made.world, made.episode, 0, 1, 2, shipped=2, sequence=2, version=5, last_visit=known)
     pilot.begin(begun)

@@ -128,6 +128,7 @@ class Mission:
         """The station takes a message; what it says to UAVs goes on the air. Returns all that it says."""
         self.heard.append((sender, message))
         self.station.handle(sender, message, 1.0)
+        self.station.committed()
         out = self.station.out.take()
         self.entries += out.entries
         self.notes += out.notes

@@ -38,6 +38,7 @@ def station_of(town: RoadMap) -> Callable[..., Station]:
 
 
 def sent(station: Station) -> list[tuple[str, m.Message]]:
+    station.committed()
     return station.out.take().sends
 
 

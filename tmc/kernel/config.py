@@ -140,6 +140,10 @@ class Training:
 @dataclass(frozen=True)
 class Journal:
     flush: float = _s(0.5, "longest time that a logged message stays in the process", "s")
+    commit: float = _s(0.05, "longest time that an accepted flight record waits for the TMC's group commit", "s")
+    durability: Literal["process", "power"] = _s(
+        "process", "what a committed record survives: kill -9 of the TMC, or a power cut as well (fsync)"
+    )
     chunk: int = _s(262_144, "size of an MCAP chunk before compression", "bytes")
 
 
@@ -152,6 +156,10 @@ class Trial:
     stall_spread: float = _s(0.0, "stalls last from (1 - spread) to (1 + spread) times as long, at random")
     stall_uav: int = _s(-1, "the one UAV that stalls; -1: all of them")
     witness: bool = _s(False, "UAVs log a hash of each observation that they decide on")
+    oath: bool = _s(False, "UAVs write down apart which of their records were acknowledged")
+    ack_early: bool = _s(
+        False, "the TMC acknowledges before it has journalled: records get lost, as the trial must see"
+    )
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ RANGES: tuple[tuple[str, float, float], ...] = (
     ("training.checkpoint_every", 1, 1_000_000_000),
     ("training.threads", 1, 1024),
     ("journal.flush", 0.01, 60.0),
+    ("journal.commit", 0.0, 60.0),
     ("journal.chunk", 1024, 64 * 1024 * 1024),
     ("trial.stall", 0.0, 60.0),
     ("trial.stall_share", 0.0, 1.0),

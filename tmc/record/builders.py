@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from array import array
 from collections.abc import Mapping
 from typing import Any
@@ -33,6 +34,13 @@ def flight_record(record: Record) -> Any:
     """The overfly.FlightRecord of a Record; `to_record` gives back the very same."""
     numbers = {name: getattr(record, name) for name in _NUMBERS}
     return FlightRecord(**numbers, **{name: getattr(record, name).tolist() for name in _ARRAYS})
+
+
+def record_digest(record: Record) -> str:
+    """BLAKE2b, hex, of all that a flight record says of the flight, whichever life of the UAV shipped it."""
+    numbers = " ".join(str(getattr(record, name)) for name in _NUMBERS if name != "life")
+    arrays = (getattr(record, name).tobytes() for name in _ARRAYS)
+    return hashlib.blake2b(b"".join((numbers.encode(), *arrays)), digest_size=16).hexdigest()
 
 
 def to_record(proto: Any) -> Record:

@@ -33,6 +33,8 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("/uav/<id>/record", "overfly.FlightRecord", "tmc", "each flight record accepted, once"),
     Channel("/tmc/sync", "overfly.Sync", "tmc", "each answer to flight records: the map handed out, and to whom"),
     Channel("/tmc/episode", "overfly.Episode", "tmc", "begin of an episode with the starts, end with its sums"),
+    Channel("/tmc/lost", "overfly.Lost", "tmc", "each UAV that the others go on without, for the rest of the episode"),
+    Channel("/tmc/state", "overfly.State", "tmc", "what the TMC holds when an episode has ended, as digests"),
     Channel("/tmc/events", "overfly.Events", "tmc", "scenario I: tick and cell of each event that appears"),
     Channel("/tmc/metrics", "overfly.TeamMetrics", "tmc", "uncertainty of the true map and the team's reward by tick"),
     Channel("/tmc/last_visit", "foxglove.Grid", "tmc", "tick of the last visit of each cell, uint32"),

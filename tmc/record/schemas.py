@@ -25,6 +25,8 @@ TYPES: dict[str, str] = {
     "Episode": "uint32 episode, string phase, uint32* starts, uint32 ticks, double uncertainty, "
     "double uncertainty_per_cell, double* reward, uint64 blocked_grid, uint64 blocked_obstacle, uint64 blocked_uav, "
     "double epsilon, uint64 updates, uint64 steps",
+    "Lost": "uint32 episode, uint32 uav, sint32 tick",
+    "State": "uint32 episode, string map, string replay, uint64 transitions",
     "Events": "uint32 episode, uint32* ticks, uint32* cells",
     "TeamMetrics": "uint32 episode, uint32 first, uint64 steps, uint64 updates, uint64 policy, double* uncertainty, "
     "float* reward",
@@ -79,6 +81,8 @@ def _own(name: str) -> Any:
 FlightRecord = _own("FlightRecord")
 Sync = _own("Sync")
 Episode = _own("Episode")
+Lost = _own("Lost")
+State = _own("State")
 Events = _own("Events")
 TeamMetrics = _own("TeamMetrics")
 Policy = _own("Policy")

@@ -45,6 +45,7 @@ class Welcome(Message):
     """The mission that the TMC runs: all settings, the map's fingerprint, the run, the newest policy it has.
 
     `tracks`: the table that the UAVs on the TMC's machine share; empty where they tell each other by beacon.
+    `sequence`: of the UAV's next record, as the TMC has it: what it has sent from there on, it sends again.
     """
 
     config: str = f.text(65_536)
@@ -52,6 +53,7 @@ class Welcome(Message):
     run: str = f.text(64)
     tracks: str = f.text(4096)
     policy: int = f.integer(0, 2**62)
+    sequence: int = f.integer(0, 2**62, default=0)
 
 
 @dataclass(frozen=True)
@@ -100,9 +102,10 @@ class Record(Message):
 
 @dataclass(frozen=True)
 class Map(Message):
-    """The TMC's answer to a record: the global map with every visit due by `tick`, and what it has acknowledged.
+    """The TMC's answer to record `sequence`: the global map with every visit due by `tick`.
 
-    `last_visit` (u16 ticks, one a monitored cell) in scenario II; `active` (u16 cells with an event) in scenario I.
+    `acknowledged`: the UAV's records below this number are in the journal for good; it may forget them. `last_visit`
+    (u16 ticks, one a monitored cell) in scenario II; `active` (u16 cells with an event) in scenario I.
     """
 
     episode: int = f.integer(1, 2**31 - 1)
@@ -110,6 +113,7 @@ class Map(Message):
     version: int = f.integer(0, 2**62)
     policy: int = f.integer(0, 2**62)
     sequence: int = f.integer(0, 2**62)
+    acknowledged: int = f.integer(0, 2**62)
     last_visit: Array = f.array("<u2", 65_535)
     active: Array = f.array("<u2", 65_535)
 
@@ -231,9 +235,10 @@ class Status(Message):
 
 @dataclass(frozen=True)
 class End(Message):
-    """The mission is over; leave."""
+    """The mission is over; leave. `acknowledged`: as in `Map`."""
 
     reason: str = f.text(1024)
+    acknowledged: int = f.integer(0, 2**62, default=0)
 
 
 @dataclass(frozen=True)

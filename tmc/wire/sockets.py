@@ -108,7 +108,7 @@ def dealer(context: zmq.Context[Any], endpoint: str, name: str) -> zmq.Socket[An
     sock.setsockopt(zmq.IDENTITY, name.encode())
     sock.setsockopt(zmq.MAXMSGSIZE, PART_LIMIT)
     sock.setsockopt(zmq.RECONNECT_IVL, 50)
-    sock.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
+    sock.setsockopt(zmq.RECONNECT_IVL_MAX, 200)
     if endpoint.startswith("tcp://"):
         sock.setsockopt(zmq.HEARTBEAT_IVL, 1000)
         sock.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3000)

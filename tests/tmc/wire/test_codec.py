@@ -243,11 +243,11 @@ def test_a_float_is_finite(value: Any, code: str) -> None:
 
 @pytest.mark.parametrize("value", [None, 7, "ab", [1, 2], b"abc", {"a": 1}, True])
 def test_an_array_is_bytes_of_whole_entries(value: Any) -> None:
-    assert refused(with_header(Map(1, 2, 3, 4, 5, EMPTY, EMPTY), last_visit=value)).code == "malformed"
+    assert refused(with_header(Map(1, 2, 3, 4, 5, 5, EMPTY, EMPTY), last_visit=value)).code == "malformed"
 
 
 def test_an_array_longer_than_its_rule_is_out_of_range() -> None:
-    frames = with_header(Map(1, 2, 3, 4, 5, EMPTY, EMPTY), last_visit=bytes(2 * 65_536))
+    frames = with_header(Map(1, 2, 3, 4, 5, 5, EMPTY, EMPTY), last_visit=bytes(2 * 65_536))
     assert refused(frames).code == "range"
 
 

@@ -42,7 +42,7 @@ EXAMPLES: tuple[Message, ...] = (
         2, 12345, 3, 1, 1, 2, 5, 4, numbers("<u2", 7, 8), numbers("u1", 3, 8), numbers("u1", 0, 1),
         numbers("<f4", 1.5, -20), numbers("<u2", 2), numbers("<u2", 9),
     ),
-    m.Map(1, 10, 5, 4, 3, numbers("<u2", 0, 10, 3), EMPTY),
+    m.Map(1, 10, 5, 4, 3, 2, numbers("<u2", 0, 10, 3), EMPTY),
     m.Alive(1, 12345, 40, -1),
     m.Lost(2, 1, 30),
     m.PolicyRequest(4),
