@@ -258,4 +258,4 @@ class Pilot:
         """r^u by the UAV's own map: the uncertainty at t + 1 just before the visit resets it."""
         if self.config.scenario == 1:
             return float(self.active[cell])
-        return self.law.value(k, int(self.last_visit[k]), self.t + 1, self._factor)
+        return self.law.value(k, self.last_visit.item(k), self.t + 1, self._factor)

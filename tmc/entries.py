@@ -73,7 +73,7 @@ def episode(flight: Flight, phase: str, epsilon: float, steps: int, updates: int
     return Entry("/tmc/episode", {
         "episode": flight.episode, "phase": phase, "starts": flight.starts, "ticks": max(flight.done, 0),
         "uncertainty": mean, "uncertainty_per_cell": mean / flight.world.law.cells.size,
-        "reward": flight.total_reward, "blocked_grid": flight.blocked[Block.GRID],
+        "reward": [*flight.total_reward], "blocked_grid": flight.blocked[Block.GRID],
         "blocked_obstacle": flight.blocked[Block.OBSTACLE], "blocked_uav": flight.blocked[Block.UAV],
         "epsilon": epsilon, "updates": updates, "steps": steps,
     })  # fmt: skip

@@ -24,6 +24,11 @@ GONE = 65_535
 """Stands for the cell of a UAV that was lost, in the ticks after its last record."""
 
 
+SOME = 64
+"""Ticks that are reckoned at once, at most."""
+_UAV = int(Block.UAV)
+
+
 class RefusedError(ValueError):
     """A record that cannot be true; nothing was changed by it."""
 
@@ -61,6 +66,7 @@ class Flight:
     def __init__(self, world: World, reward: RewardLaw, replay: Replay, episode: int, version: int) -> None:
         config = world.config
         self.world, self.reward, self.replay, self.episode = world, reward, replay, episode
+        self._rules = config.reward
         self.T, self.N = config.training.ticks, config.team.size
         self.scenario = config.scenario
         self.starts = world.starts(episode)
@@ -130,31 +136,38 @@ class Flight:
         if not (r.cells.size == r.tick - r.first + 1 and r.actions.size == r.blocks.size == r.rewards.size == moves):
             raise RefusedError(f"record of UAV {r.uav} has arrays that do not match its ticks {r.first}..{r.tick}")
         self._check_path(r)
-        seen = r.seen_tick
-        if seen.size != r.seen_cell.size or (seen.size and not (r.first <= seen.min() and seen.max() <= r.tick)):
+        ticks, cells = r.seen_tick.tolist(), r.seen_cell.tolist()
+        if len(ticks) != len(cells) or any(not r.first <= t <= r.tick for t in ticks):
             raise RefusedError(f"record of UAV {r.uav} has sightings outside its ticks")
-        if r.seen_cell.size and r.seen_cell.max() >= self.world.grid.size:
+        if any(cell >= self.world.grid.size for cell in cells):
             raise RefusedError(f"record of UAV {r.uav} has a sighting off the grid")
 
     def _check_path(self, r: Record) -> None:
-        """Every cell follows from the one before by the action, or is the same where the move was blocked."""
+        """Every cell follows from the one before by the action, or is the same where the move was blocked.
+
+        Plain lists: a record has some ten moves, for which NumPy's calls cost several times as much.
+        """
         cells, moves = r.cells.tolist(), self.world.moves
-        if max(cells) >= len(moves) or self.world.map.blocked[r.cells].any():
-            raise RefusedError(f"record of UAV {r.uav} has a cell off the grid or on an obstacle")
         if r.first == 0 and cells[0] != self.starts[r.uav]:
             raise RefusedError(f"UAV {r.uav} did not start on cell {self.starts[r.uav]}")
-        if r.actions.size and (r.actions.max() > STAY or r.blocks.max() > max(Block)):
-            raise RefusedError(f"record of UAV {r.uav} has an unknown action or block")
         here = cells.pop(0) if r.first == 0 else int(self.cells[r.first - 1, r.uav])
         for action, block, cell in zip(r.actions.tolist(), r.blocks.tolist(), cells, strict=True):
+            if action > STAY or block > _UAV:
+                raise RefusedError(f"record of UAV {r.uav} has an unknown action or block")
             after, static = moves[here][action]
-            if cell != (here if block else after) or (block == Block.NONE and static):
-                raise RefusedError(f"record of UAV {r.uav} jumps: a cell does not follow from the action before it")
-            if static != (0 if block == Block.UAV else block):
-                raise RefusedError(f"record of UAV {r.uav} says that a move was blocked by what is not there")
-            if block == Block.UAV and action == STAY:
+            if cell != (here if block else after) or static != (0 if block == _UAV else block):
+                raise RefusedError(f"record of UAV {r.uav} {self._why_not(cell, here if block else after, block)}")
+            if block == _UAV and action == STAY:
                 raise RefusedError(f"record of UAV {r.uav} says that another UAV kept it from staying where it is")
             here = cell
+
+    def _why_not(self, cell: int, due: int, block: int) -> str:
+        """What is wrong with a move to `cell` that should have led to `due`."""
+        if cell >= self.world.grid.size or self.world.map.blocked[cell]:
+            return "has a cell off the grid or on an obstacle"
+        if cell != due or not block:
+            return "jumps: a cell does not follow from the action before it"
+        return "says that a move was blocked by what is not there"
 
     def exchanges(self) -> list[Exchange]:
         """Run the exchange clock as far as the records allow; one entry for each that could be held."""
@@ -213,20 +226,25 @@ class Flight:
         belief, track = self.beliefs[i].copy(), self.cells[: tick + 1, i].copy()
         return Begin(self.episode, tick, shipped, sequence, self.version, policy, belief, track, lost)
 
-    def uncertainty(self, last_visit: NDArray[np.uint16], t: int) -> NDArray[np.float64]:
-        """u_k(t) over the monitored cells, scenario II."""
+    def uncertainty(self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64]) -> NDArray[np.float64]:
+        """u_k(t) over the monitored cells, scenario II; shapes as in `UncertaintyLaw.values`."""
         return self.world.law.values(last_visit, t, self.factor)
 
     def settle(self) -> Truth:
         """Run the truth clock up to the slowest UAV; returns what became final since the last call."""
         self._settle(min((t for i, t in enumerate(self.reported) if i not in self.lost), default=self.T))
         truth, self._fresh = self._fresh, Truth(self.done + 1, [], [], [], [])
-        for t in range(truth.first, self.done + 1):
-            # A lost UAV may have been seen until its next exchange, and that seeing remembered until the one after it.
-            sure = not any(last < t <= last + 2 * self.world.config.T_u for last in self.lost.values())
-            rewards = self.rewards[t]
-            self.replay.add_row(self.episode, t, self.cells[t], self.actions[t], rewards, self.base[t], sure=sure)
+        ticks = slice(truth.first, self.done + 1)
+        if truth.uncertainty:
+            sure = [self._sure(t) for t in range(truth.first, self.done + 1)]
+            rows = (self.cells[ticks], self.actions[ticks], self.rewards[ticks], self.base[ticks])
+            self.replay.add_rows(self.episode, truth.first, *rows, sure)
         return truth
+
+    def _sure(self, t: int) -> bool:
+        """False for the ticks at which nobody knows whom a lost UAV was seen by: until its next exchange it may have
+        been seen, and that seeing remembered until the exchange after it."""
+        return not any(last < t <= last + 2 * self.world.config.T_u for last in self.lost.values())
 
     def lose(self, uav: int) -> int:
         """Go on without a UAV: its visits count up to its last record, the tick of which is returned."""
@@ -245,55 +263,62 @@ class Flight:
 
     def _settle(self, upto: int) -> None:
         while self.done < upto:
-            t = self.done = self.done + 1
+            self._settle_some(range(self.done + 1, min(self.done + SOME, upto) + 1))
+
+    def _settle_some(self, ticks: range) -> None:
+        """These ticks are final; the map's uncertainty is reckoned for all of them at once."""
+        fresh, maps = self._fresh, np.empty((len(ticks), self.last_visit.size), "<u2")
+        sums = []
+        for t in ticks:
             present = self.present(t)
             rewards = self._visit(t, present)
-            self._fresh.present.append(len(present))
-            self._fresh.reward.append(sum(rewards) / max(len(present), 1))
-            self._fresh.uncertainty.append(self._true_uncertainty(t, present))
-            if t:
-                self.total_uncertainty += self._fresh.uncertainty[-1]
+            fresh.present.append(len(present))
+            fresh.reward.append(sum(rewards) / max(len(present), 1))
+            if self.scenario == 1:
+                sums.append(self._events(t, present))
+            maps[t - ticks[0]] = self.last_visit
+        self.done = ticks[-1]
+        if self.scenario == 2:
+            sums = self.uncertainty(maps, np.array(ticks)[:, None]).sum(axis=1).tolist()
+        fresh.uncertainty.extend(sums)
+        for u in sums[1:] if ticks[0] == 0 else sums:  # one by one: the same bits, however many come at once
+            self.total_uncertainty += u
 
     def _visit(self, t: int, present: list[tuple[int, int]]) -> list[float]:
         """Rewards of the UAVs that are there at tick t (Sec. III-B), then the visits of that tick."""
-        index, rewards = self.world.law.index_list, []
+        index, blocks, last_visit, rewards = self.world.law.index_list, self.blocks[t].tolist(), self.last_visit, []
         for i, cell in present:
-            k = index[cell]
+            k, visited = index[cell], self.visited[i]
             if t:
-                block = int(self.blocks[t, i])
-                reward = self._reward(t, i, cell, k, block)
-                self.rewards[t, i] = reward
+                reward = self._reward(t, i, cell, k, blocks[i])
                 self.total_reward[i] += reward
-                if block:
-                    self.blocked[Block(block)] += 1
                 rewards.append(reward)
-            self.visited[i].add(cell)
+                if blocks[i]:
+                    self.blocked[Block(blocks[i])] += 1
+            visited.add(cell)
             self.visited_by_team.add(cell)
             if k >= 0:
-                self.last_visit[k] = t
+                last_visit[k] = t
+        if t:
+            self.rewards[t, [i for i, _ in present]] = rewards
         return rewards
 
     def _reward(self, t: int, i: int, cell: int, k: int, block: int) -> float:
         """By the true map, or as the UAV reckoned it; with novelty for the UAV, or for the team."""
-        rules, novel = self.world.config.reward, cell not in self.visited[i]
         if block:
-            return rules.collision
-        counted = novel if rules.novelty == "own" else cell not in self.visited_by_team
-        if rules.uncertainty == "own":
-            return float(self.own_rewards[t, i]) + rules.new_cell * (counted - novel)
-        return self.reward(False, counted, k, self._before_visit(k, cell, t))
-
-    def _before_visit(self, k: int, cell: int, t: int) -> float:
+            return self._rules.collision
+        novel = cell not in self.visited[i]
+        counted = novel if self._rules.novelty == "own" else cell not in self.visited_by_team
+        if self._rules.uncertainty == "own":
+            return float(self.own_rewards[t, i]) + self._rules.new_cell * (counted - novel)
         if k < 0:
-            return 0.0
+            return self.reward(False, counted, k, 0.0)
         if self.scenario == 1:
-            return float(self.active[cell])
-        return self.world.law.value(k, int(self.last_visit[k]), t, self.factor)
+            return self.reward(False, counted, k, float(self.active[cell]))
+        return self.reward(False, counted, k, self.world.law.value(k, self.last_visit.item(k), t, self.factor))
 
-    def _true_uncertainty(self, t: int, present: list[tuple[int, int]]) -> float:
-        """sum_k u_k(t), the inner sum of eq. (6); in scenario I it also lets the events of the slot in."""
-        if self.scenario == 2:
-            return float(self.uncertainty(self.last_visit, t).sum())
+    def _events(self, t: int, present: list[tuple[int, int]]) -> float:
+        """Scenario I: what was visited is cleared and the events of the slot come in; sum_k e_k(t)."""
         if t:
             arrivals = self.world.arrivals(self.episode, t)
             self.active, new = step_events(self.active, [cell for _, cell in present], arrivals)

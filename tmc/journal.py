@@ -38,6 +38,8 @@ class Journal:
         self._since: float | None = None
         if not self.found:
             self._begin(world)
+        else:  # the writer has synced what it took over
+            self._swear()
 
     def _begin(self, world: World) -> None:
         config = json.dumps(flat(world.config), indent=1)
@@ -67,6 +69,17 @@ class Journal:
         """Hand over all entries so far: to the system, or to the disk."""
         self.writer.flush(fsync=self.world.config.journal.durability == "power")
         self._since = None
+        self._swear()
+
+    def _swear(self) -> None:
+        """In a trial with power cuts: how much of which file the disk has, for whoever simulates them."""
+        config = self.world.config
+        if config.trial.oath and config.journal.durability == "power":
+            path = self.folder / "oaths" / "tmc.txt"
+            path.parent.mkdir(exist_ok=True)
+            now = self.writer.active.stat()
+            with path.open("a") as file:
+                file.write(f"{now.st_ino} {now.st_size}\n")
 
     def keep_policies(self, held: Mapping[int, bytes]) -> None:
         """Make the folder `policies` hold these files, and none of those that it held before."""

@@ -1,86 +1,194 @@
 """Recovery by replay: the journal, played through the station, gives the state of the TMC that wrote it.
 
 Only what came from outside is taken from the journal: flight records, policies, who was lost, when episodes began and
-how far the learner was. Everything else follows, and what a kill kept from being written is written then.
+how far the learner was. Everything else follows, and what a kill kept from being written is written then. Of episodes
+so old that the replay memory holds nothing of them, only the sums are taken.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 from tmc.entries import Entry
 from tmc.flight import RefusedError
 from tmc.journal import policy_path
+from tmc.kernel.config import Config
 from tmc.record.builders import to_record
 from tmc.record.errors import RecordError
-from tmc.record.reader import Entry as Logged
-from tmc.record.reader import Log
+from tmc.record.frames import Raw
+from tmc.record.reader import Log, decode
+from tmc.roster import Member
 from tmc.station import Station
+
+Taker = Callable[[Station, Any, Path, float], None]
 
 
 def recover(station: Station, path: Path, now: float) -> list[Entry]:
     """Bring a new station to the state that the journal at `path` tells of; returns what is missing in the journal.
 
-    RecordError when the journal contradicts itself, or is of another mission.
+    RecordError when the journal contradicts itself.
     """
-    station.playing = True
-    try:
-        missing = play(station, Log(path).entries(), path.parent, now)
-    finally:
-        station.playing = False
-    for member in station.roster:
-        member.durable = member.sequence
+    log = Log(path)
+    missing = play(station, log.raw(), path.parent, now, skipped(log, station.config))
+    for i, member in enumerate(station.roster):
+        member.heard = now
+        if station.flight is not None and member.life < 0 and i not in station.flight.lost:
+            member.life = 0  # it has flown nothing yet, so its process is not known: it may be silent for ever
     station.feed.recovered = True
+    station.committed()
     station.out.take()
     return missing
 
 
-def play(station: Station, journal: Iterable[Logged], folder: Path, now: float) -> list[Entry]:
-    """Play entries of a journal; returns those that follow from them and are not among them."""
-    written: Counter[str] = Counter()
-    made: list[Entry] = []
-    for logged in journal:
-        written[logged.topic] += 1
-        taker = _TAKERS.get(logged.message.DESCRIPTOR.name)
-        if taker is not None:
-            try:
-                taker(station, logged.message, folder, now)
-            except RefusedError as refused:
-                raise RecordError(f"the journal contradicts itself, so do not go on with it: {refused}") from None
-            made += station.out.take().entries
-    missing = []
-    for entry in made:
-        written[entry.topic] -= 1
-        if written[entry.topic] < 0:
-            missing.append(entry)
-    return missing
+def play(station: Station, journal: Iterable[Raw], folder: Path, now: float, skip: range = range(0)) -> list[Entry]:
+    """Play the messages of a journal; returns those that follow from them and are not among them.
+
+    `folder` holds the policy files; of the episodes in `skip` only the sums are taken.
+    """
+    station.playing, balance = True, _Balance()
+    balance.made(station.out.take().entries)  # a fixed policy is taken before anything is heard
+    try:
+        for raw in journal:
+            balance.written(raw.topic)
+            if raw.schema in _TOLD:
+                _take(station, decode(raw), folder, now, skip)
+                balance.made(station.out.take().entries)
+        station.settle()
+        balance.made(station.out.take().entries)
+    finally:
+        station.playing = False
+    return balance.missing()
+
+
+def _take(station: Station, message: Any, folder: Path, now: float, skip: range) -> None:
+    name = message.DESCRIPTOR.full_name
+    takers = _TAKERS if getattr(message, "episode", 0) not in skip else _SUMS
+    try:
+        if name in takers:
+            takers[name](station, message, folder, now)
+    except RefusedError as refused:
+        raise RecordError(f"the journal contradicts itself, so do not go on with it: {refused}") from None
+
+
+class _Balance:
+    """What the station makes against what is written, by topic: both come in the same order."""
+
+    def __init__(self) -> None:
+        self._written: Counter[str] = Counter()
+        self._made: dict[str, deque[tuple[int, Entry]]] = {}
+        self._count = 0
+
+    def written(self, topic: str) -> None:
+        if made := self._made.get(topic):
+            made.popleft()
+        else:
+            self._written[topic] += 1
+
+    def made(self, entries: list[Entry]) -> None:
+        for entry in entries:
+            self._count += 1
+            if self._written[entry.topic]:
+                self._written[entry.topic] -= 1
+            else:
+                self._made.setdefault(entry.topic, deque()).append((self._count, entry))
+
+    def missing(self) -> list[Entry]:
+        """What was made and is not written, in its order."""
+        left = sorted((item for made in self._made.values() for item in made), key=lambda item: item[0])
+        return [entry for _, entry in left]
+
+
+# Episodes that need not be flown again.
+
+
+def skipped(log: Log, config: Config) -> range:
+    """The episodes of which nothing is left: neither transitions in the replay memory, nor the start of learning."""
+    ended, lost = 0, set[int]()
+    for entry in log.entries(("/tmc/episode", "/tmc/lost")):
+        if entry.topic == "/tmc/lost":
+            lost.add(entry.message.episode)
+        elif entry.message.phase == "end":
+            ended = entry.message.episode
+    # Transitions by episode, of one UAV; around a loss some are left out, so such an episode counts as none.
+    starts = [0 if e in lost else config.training.ticks for e in range(1, ended + 1)]
+    team, needed = config.team.size, config.replay.learn_start
+    head = next((e for e, sum_ in enumerate(accumulate(starts), 1) if sum_ * team >= needed), ended)
+    kept = config.replay.capacity // team
+    tail = next((n for n, sum_ in enumerate(accumulate(reversed(starts)), 1) if sum_ >= max(kept, 1)), ended)
+    return range(head + 1, ended - tail + 1)
+
+
+def _sum_episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    if message.phase == "begin":
+        return
+    _in_turn(station, message)
+    blocked = (message.blocked_grid, message.blocked_obstacle, message.blocked_uav)
+    station.episodes, station.steps = message.episode, message.steps
+    station.ticks += message.ticks
+    station.limiter.ticks += message.ticks
+    station.limiter.updates = message.updates
+    station.blocked += sum(blocked)
+    station.blocked_by_uav += message.blocked_uav
+
+
+def _sum_record(station: Station, message: Any, _folder: Path, now: float) -> None:
+    _next_of(station, message, now).sequence += 1
+
+
+def _sum_sync(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    station.version = message.version
+
+
+_SUMS: dict[str, Taker] = {
+    "overfly.Episode": _sum_episode,
+    "overfly.FlightRecord": _sum_record,
+    "overfly.Sync": _sum_sync,
+}
+
+# Episodes that are flown again.
+
+
+def _in_turn(station: Station, message: Any) -> None:
+    if station.flight is not None or station.episodes != message.episode - 1:
+        raise RecordError(f"the journal has episode {message.episode} out of turn: do not go on with it")
+
+
+def _next_of(station: Station, message: Any, now: float) -> Member:
+    """The UAV whose next record this is, and its process."""
+    team = station.roster
+    if message.uav >= len(team) or message.sequence != team[message.uav].sequence:
+        text = f"the journal has record {message.sequence} of UAV {message.uav} out of turn: do not go on with it"
+        raise RecordError(text)
+    team[message.uav].live(message.life, now)
+    return team[message.uav]
 
 
 def _episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
     begun = station.flight is not None and station.flight.episode == message.episode
     if message.phase == "begin" and not begun:
-        if station.flight is not None or station.episodes != message.episode - 1:
-            raise RecordError(f"the journal begins episode {message.episode} out of turn: do not go on with it")
+        _in_turn(station, message)
         station.begin_episode([])
+    elif message.phase == "end":
+        station.settle()
 
 
 def _record(station: Station, message: Any, _folder: Path, now: float) -> None:
     record, flight = to_record(message), station.flight
-    member = station.roster[record.uav]
-    if flight is None or record.episode != flight.episode or record.sequence != member.sequence:
-        raise RecordError(f"the journal has record {record.sequence} of UAV {record.uav} out of turn: do not go on")
-    member.live(record.life, now)
+    _next_of(station, message, now)
+    if flight is None or record.episode != flight.episode:
+        raise RecordError(f"the journal has a record of episode {record.episode} out of turn: do not go on with it")
     station.accept(flight, record)
 
 
 def _lost(station: Station, message: Any, _folder: Path, _now: float) -> None:
-    if station.flight is not None and message.uav not in station.flight.lost:
-        station.lose(station.flight, message.uav)
-        station.go_on(station.flight)
+    flight, uav = station.flight, message.uav
+    if flight is not None and uav < flight.N and uav not in flight.lost:
+        station.lose(flight, uav)
 
 
 def _policy(station: Station, message: Any, folder: Path, _now: float) -> None:
@@ -98,13 +206,15 @@ def _model(message: Any, folder: Path) -> bytes:
 
 
 def _metrics(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    station.settle()  # here the TMC did; in between it may have taken any number of records
     station.limiter.updates = message.updates
 
 
-_TAKERS: dict[str, Callable[[Station, Any, Path, float], None]] = {
-    "Episode": _episode,
-    "FlightRecord": _record,
-    "Lost": _lost,
-    "Policy": _policy,
-    "TeamMetrics": _metrics,
+_TAKERS: dict[str, Taker] = {
+    "overfly.Episode": _episode,
+    "overfly.FlightRecord": _record,
+    "overfly.Lost": _lost,
+    "overfly.Policy": _policy,
+    "overfly.TeamMetrics": _metrics,
 }
+_TOLD = _TAKERS.keys() | _SUMS.keys()

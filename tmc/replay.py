@@ -8,6 +8,7 @@ since (Sec. II-D). So a transition costs about 11 bytes and its share of a frame
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,7 +41,7 @@ class Ring:
     def __init__(self, length: int, width: int, dtype: str) -> None:
         self.data = np.zeros((length, width) if width else length, dtype)
 
-    def __setitem__(self, number: int, value: object) -> None:
+    def __setitem__(self, number: int | Ints, value: object) -> None:
         self.data[number % len(self.data)] = value
 
     def __getitem__(self, number: Ints) -> NDArray[Any]:
@@ -82,35 +83,43 @@ class Replay:
         self.frames_in += 1
         return self.frames_in - 1
 
-    def add_row(
+    def add_rows(
         self,
         episode: int,
-        tick: int,
+        first: int,
         cells: NDArray[np.uint16],
         actions: NDArray[np.uint8],
         rewards: Floats,
         base: Ints,
-        *,
-        sure: bool = True,
+        sure: Sequence[bool],
     ) -> None:
-        """Tick `tick` of `episode`, ticks in order from 0. Shapes (N,): actions and rewards that led to this tick.
+        """Ticks of `episode` from `first` on, all in order from 0. Shapes (n, N): what led to a tick stands with it.
 
         A cell off the grid stands for a UAV that was lost. A row that is not `sure` is part of no transition.
         """
         row = self.rows_in
-        self._sure_from = self._sure_from if sure else row + 1
-        self.cells[row], self.actions[row], self.rewards[row], self.base[row] = cells, actions, rewards, base
-        self.tick[row], self.episode[row] = tick, episode
-        self.rows_in += 1
-        if tick == 0:
+        rows = np.arange(row, row + len(cells))
+        self.cells[rows], self.actions[rows], self.rewards[rows], self.base[rows] = cells, actions, rewards, base
+        self.tick[rows], self.episode[rows] = np.arange(first, first + len(cells)), episode
+        self.rows_in += len(cells)
+        if first == 0:
             self._remember(episode)
-        oldest = tick - self.n_step
-        newest = tick - 1 if tick == self.world.config.training.ticks else oldest  # a time limit cuts n-step sums short
-        for start_tick in range(max(0, oldest), newest + 1):
-            start = row - tick + start_tick
-            if start >= self._sure_from:
-                self.starts[self.starts_in], self.ends[self.starts_in] = start, row
-                self.starts_in += 1
+        self._add_starts(row, first, sure)
+
+    def _add_starts(self, row: int, first: int, sure: Sequence[bool]) -> None:
+        """The transitions that end in the rows from `row` on, the first of which is of tick `first`."""
+        starts, ends = [], []
+        for number, known in enumerate(sure):
+            end, tick = row + number, first + number
+            self._sure_from = self._sure_from if known else end + 1
+            last = tick == self.world.config.training.ticks  # a time limit cuts n-step sums short
+            for back in range(min(self.n_step, tick), 0 if last else self.n_step - 1, -1):
+                if end - back >= self._sure_from:
+                    starts.append(end - back)
+                    ends.append(end)
+        place = np.arange(self.starts_in, self.starts_in + len(starts))
+        self.starts[place], self.ends[place] = starts, ends
+        self.starts_in += len(starts)
 
     def _remember(self, episode: int) -> None:
         """Keep the initial map of an episode, and drop those of episodes of which no row is left."""

@@ -23,6 +23,11 @@ class Outbox:
     entries: list[entries.Entry] = field(default_factory=list)
     notes: list[tuple[str, str]] = field(default_factory=list)
 
+    def take_sends(self) -> list[tuple[str, m.Message]]:
+        """The messages alone."""
+        taken, self.sends = self.sends, []
+        return taken
+
     def take(self) -> Outbox:
         """All of it; this outbox is empty afterwards."""
         taken = Outbox(self.sends, self.entries, self.notes)
@@ -96,6 +101,8 @@ def record_problem(members: list[Member], sender: str, record: m.Record) -> Prob
         return "refused", f"{sender} cannot ship a record of UAV {record.uav}"
     if members[record.uav].life < 0:
         return "state", f"{sender} is not known here: say hello first"
-    if record.life != members[record.uav].life:
+    if record.life in members[record.uav].past:
         return "fenced", f"a newer process flies {sender}: leave"
+    if record.life != members[record.uav].life:  # it said hello to an earlier life of the TMC
+        return "state", f"this process of {sender} is not known here: say hello first"
     return None

@@ -11,7 +11,7 @@ from typing import Any
 import zmq
 
 from tmc.journal import Journal
-from tmc.roster import LEARNER, Outbox
+from tmc.roster import LEARNER
 from tmc.station import Station
 from tmc.wire import sockets
 from tmc.wire.codec import CodecError, decode
@@ -19,6 +19,9 @@ from tmc.wire.messages import Bye, End
 
 BURST = 64
 """Messages taken from one socket before the other has its turn."""
+REST = 0.01
+"""Seconds that book-keeping waits for more of its kind: a dozen records in a row cost a third of one at a time, since
+the processor has the code at hand."""
 FAREWELL = 60.0
 """Seconds that the TMC waits for the last client to leave once the mission is over."""
 
@@ -35,6 +38,8 @@ class Service:
         self._here: set[str] = set()
         self._over: float | None = None
         self._taken: Counter[str] = Counter()
+        self._unsettled: float | None = None
+        """When the oldest entry came that is not journalled, seconds of the monotonic clock."""
 
     def serve(self, stop: Callable[[], bool]) -> bool:
         """The main loop. True when the mission came to its end, False when it was stopped."""
@@ -45,8 +50,8 @@ class Service:
             for sock, _ in poller.poll(self._patience()):
                 self._drain(sock)
             self.station.tick(time.monotonic())
-            self._post(self.station.out.take())
-            self._commit()
+            self._send()
+            self._settle()
             self.journal.writer.maybe_flush()
             if self._finished():
                 self._sum_up()
@@ -57,15 +62,24 @@ class Service:
 
     def _patience(self) -> int:
         """Milliseconds to wait for a message."""
-        due = self.journal.due
-        return 100 if due is None else math.ceil(1000 * due)
+        due = self.journal.due if self._unsettled is None else self._unsettled + REST - time.monotonic()
+        return 100 if due is None else max(0, math.ceil(1000 * due))
 
-    def _commit(self) -> None:
-        """A group commit, when one is due; only then are records acknowledged, with the answers to later ones."""
-        if self.journal.due == 0.0 or (self.journal.due is not None and self.station.phase == "done"):
+    def _settle(self) -> None:
+        """The book-keeping that nobody waits for, and a group commit where one is due; only then are records
+        acknowledged, with the answers to later ones."""
+        station, since = self.station, self._unsettled
+        if since is not None and (station.settle_now or time.monotonic() - since >= REST):
+            self._unsettled = None
+            station.settle()
+            self._send()
+            if station.learning:
+                self.journal.keep_policies(station.policies.held())
+            self.journal.take(station.out.take())
+        if self.journal.due == 0.0 or (self.journal.due is not None and station.phase == "done"):
             self.journal.commit()
-            self.station.committed()
-            self._post(self.station.out.take())
+            station.committed()
+            self._send()
 
     def _drain(self, sock: zmq.Socket[Any]) -> None:
         for _ in range(BURST):
@@ -73,7 +87,9 @@ class Service:
             if frames is None:
                 return
             self._take(sock, bytes(frames[0]), frames[1:])
-            self._post(self.station.out.take())
+            if self.station.config.trial.ack_early:
+                self.station.committed()  # which it is not: a trial must see what comes of that
+            self._send()
 
     def _take(self, sock: zmq.Socket[Any], identity: bytes, frames: list[Any]) -> None:
         sender = sockets.sender_name(identity)
@@ -89,14 +105,14 @@ class Service:
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
-        self.station.handle(sender, message, time.monotonic())
+        self.station.answer(sender, message, time.monotonic())
 
-    def _post(self, outbox: Outbox) -> None:
-        """Journal first, then send."""
-        if outbox.entries and self.station.learning:
-            self.journal.keep_policies(self.station.policies.held())
-        self.journal.take(outbox)
-        for name, message in outbox.sends:
+    def _send(self) -> None:
+        """Send what the station has for others. The journal can wait: only what is committed is acknowledged."""
+        out = self.station.out
+        if self._unsettled is None and (out.entries or out.notes):
+            self._unsettled = time.monotonic()
+        for name, message in out.take_sends():
             # Who was not heard yet may have been connected to an earlier life of this process.
             sock, identity = self._where.get(name) or (self.feed if name == LEARNER else self.sync, name.encode())
             sockets.send(sock, message, identity)

@@ -10,9 +10,10 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from tmc import entries, roster
+from tmc import entries, relay, roster
+from tmc.early import Early
 from tmc.feed import WINDOW, Feed
-from tmc.flight import Exchange, Flight, RefusedError, Truth
+from tmc.flight import Exchange, Flight, Truth
 from tmc.kernel.config import flat
 from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
@@ -21,7 +22,6 @@ from tmc.limiter import Limiter
 from tmc.policies import Policies
 from tmc.replay import Replay
 from tmc.roster import LEARNER, Member, Outbox, uav_name
-from tmc.status import status
 from tmc.wire import messages as m
 
 GOODBYE = "the mission is over"
@@ -41,16 +41,14 @@ class Station:
         self.reward = RewardLaw(config, world.law.q)
         ratio = config.replay.updates_per_tick if self.learning else 0.0
         self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
-        self.roster = [Member() for _ in range(config.team.size)]
+        self.roster, self.early = [Member() for _ in range(config.team.size)], Early()
         self.flight: Flight | None = None
         self.version = self.ticks = self.steps = self.episodes = self.rejected = self.blocked = self.blocked_by_uav = 0
         self.uncertainty = self.episode_uncertainty = self.loss = 0.0
-        self.policies = Policies()
-        self.playing = False  # a journal (tmc.recovery): then episodes begin where it says so
+        self.playing = self._ended = False  # playing: a journal (tmc.recovery): then episodes begin where it says so
         self.feed = Feed(self.replay, self.limiter, config.dqn.batch)
-        self.out = Outbox()
+        self.policies, self.out = Policies(), Outbox()
         self._held: list[tuple[str, m.Message]] = []
-        self._ended = False
         if policy is not None:
             self.take_policy(1, policy, 0, 0.0)
 
@@ -79,6 +77,11 @@ class Station:
 
     def handle(self, sender: str, message: m.Message, now: float) -> None:
         """Take one message from `sender` at time `now`, seconds; everything that follows from it is in `out`."""
+        self.answer(sender, message, now)
+        self.settle()
+
+    def answer(self, sender: str, message: m.Message, now: float) -> None:
+        """As `handle`, but only what somebody may wait for; `settle` does the rest, and must be called next."""
         handler = _HANDLERS.get(type(message))
         if handler is None:
             self.reject(sender, "state", f"{type(message).__name__} is not a message for the TMC")
@@ -91,7 +94,7 @@ class Station:
         """Count and note a frame that changes nothing, and tell its sender what was wrong."""
         self.rejected += 1
         self.out.notes.append(("WARNING", f"rejected a frame from {sender}: {text}"))
-        self._send(sender, m.Error(code, text[:1024]))
+        self.send(sender, m.Error(code, text[:1024]))
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))
@@ -102,7 +105,7 @@ class Station:
                 self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
                 return
             self.feed.welcome(hello)
-            self._send(sender, welcome)
+            self.send(sender, welcome)
             self._finish_if_done()
             return
         problem = roster.hello_problem(self.roster, sender, hello)
@@ -110,10 +113,11 @@ class Station:
             self.reject(sender, *problem)
             return
         if self.roster[hello.uav].live(hello.life, now):
+            self.early.drop(hello.uav)
             self.out.notes.append(("WARNING", f"{sender} is back with a new process"))
-        self._send(sender, welcome)
+        self.send(sender, welcome)
         if self._ended:
-            self._send(sender, m.End(GOODBYE, self.roster[hello.uav].durable))
+            self.send(sender, m.End(GOODBYE, self.roster[hello.uav].durable))
         elif self.flight is not None:
             if hello.uav not in self.flight.lost:  # who was lost is back with the next episode
                 self._resume(hello.uav)
@@ -130,34 +134,42 @@ class Station:
         flight = self.flight
         if flight is not None and record.uav in flight.lost:
             return  # too late: the others went on without it
-        if record.sequence < member.sequence:  # a repeat: it is known, and perhaps answered
+        following = member.sequence + self.early.count(record.uav)
+        if record.sequence < following:  # a repeat: it is known, and perhaps answered
             if member.answer is not None and member.answer.sequence == record.sequence:
-                self._send(sender, member.answer)
-            return
-        if flight is None or record.episode != flight.episode or record.sequence > member.sequence:
+                self.send(sender, member.answer)
+        elif flight is None or record.episode != flight.episode or record.sequence > following:
             self.reject(sender, "state", f"record {record.sequence} of {sender} is not the next one")
-            return
-        try:
-            self.accept(flight, record)
-        except RefusedError as refused:
-            self.reject(sender, "refused", str(refused))
+        else:
+            self.early.keep(record)
+            self.early.accept(self, flight)
 
     def accept(self, flight: Flight, record: m.Record) -> None:
         """Take a UAV's next record, and all that follows from it; raises RefusedError, and changes nothing."""
         flight.accept(record)
         self.roster[record.uav].sequence += 1
         self.out.entries.append(entries.flight_record(record))
-        self.go_on(flight)
+        self._exchange(flight)
 
-    def go_on(self, flight: Flight) -> None:
-        """Answer the exchanges that can be held, journal what became final, and end the episode when it is over."""
+    def settle(self) -> None:
+        """Journal what became final, end the episode when it is over, and let the learner have what it is owed."""
+        if self.flight is not None:
+            self._journal_truth(self.flight, self.flight.settle())
+            if self.flight.over:
+                self._end_episode(self.flight)
+        self._serve()
+
+    @property
+    def settle_now(self) -> bool:
+        """True when the team may wait for `settle`: for the limiter, or, when the last exchange was, for an episode."""
+        return self.learning or self.flight is None or self.flight.next_exchange > self.flight.T
+
+    def _exchange(self, flight: Flight) -> None:
+        """Answer the exchanges that can be held."""
         for exchange in flight.exchanges():
             self._answer(flight, exchange)
-        self._journal_truth(flight, flight.settle())
-        if flight.over:
-            self._end_episode(flight)
-        self._release()
-        self._serve()
+        if not self.learning:
+            self._release()
 
     def _answer(self, flight: Flight, exchange: Exchange) -> None:
         self.version = exchange.version
@@ -200,9 +212,9 @@ class Station:
     def _resume(self, i: int) -> None:
         flight, member = self.flight, self.roster[i]
         assert flight is not None
-        self._send(uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence))
+        self.send(uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence))
         if member.answer is not None and member.answer.tick == flight.reported[i]:
-            self._send(uav_name(i), member.answer)
+            self.send(uav_name(i), member.answer)
 
     def _end_episode(self, flight: Flight) -> None:
         self.episodes = flight.episode
@@ -227,7 +239,7 @@ class Station:
             return
         if self.learning and not self.feed.told_the_end:
             self.feed.told_the_end = True
-            self._send(LEARNER, m.End(GOODBYE))
+            self.send(LEARNER, m.End(GOODBYE))
         if not self._ended:
             self._ended = True
             self._held += [(uav_name(i), m.End(GOODBYE, uav.durable)) for i, uav in enumerate(self.roster)]
@@ -246,10 +258,11 @@ class Station:
             for to, message in self._held:
                 if isinstance(message, m.Map):
                     self.roster[int(to[4:])].answer = message
-                self._send(to, message)
+                self.send(to, message)
             self._held.clear()
 
-    def _send(self, to: str, message: m.Message) -> None:
+    def send(self, to: str, message: m.Message) -> None:
+        """Put a message for somebody into the outbox."""
         self.out.sends.append((to, message))
 
     # The learner.
@@ -263,7 +276,7 @@ class Station:
     def _serve(self) -> None:
         """Answer minibatch requests as far as the limiter allows."""
         for minibatch in self.feed.serve(self.episodes, self.ticks):
-            self._send(LEARNER, minibatch)
+            self.send(LEARNER, minibatch)
         self._release()
         self._finish_if_done()
 
@@ -272,7 +285,7 @@ class Station:
             self.reject(sender, "refused", f"policy {push.version} is not newer than {self.policies.newest}")
             return
         self.take_policy(push.version, push.model, push.updates, push.loss)
-        self._send(sender, m.Ack(push.version))
+        self.send(sender, m.Ack(push.version))
         self._try_begin()
 
     def take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
@@ -288,30 +301,9 @@ class Station:
         if found is None:
             self.reject(sender, "state", f"there is no policy {request.version}")
         else:
-            self._send(sender, m.Policy(*found))
+            self.send(sender, m.Policy(*found))
 
-    # The rest.
-
-    def _beacon(self, sender: str, beacon: m.Beacon, _now: float) -> None:
-        if uav_name(beacon.uav) != sender:
-            self.reject(sender, "refused", f"{sender} cannot send a beacon of UAV {beacon.uav}")
-            return
-        for i in beacon.to.tolist():
-            if i < len(self.roster) and i != beacon.uav:
-                self._send(uav_name(i), beacon)
-
-    def _alive(self, sender: str, alive: m.Alive, now: float) -> None:
-        if 0 <= alive.uav < len(self.roster) and sender == uav_name(alive.uav):
-            member = self.roster[alive.uav]
-            if alive.life == member.life:
-                member.heard, member.named = now, False
-
-    def _status_request(self, sender: str, _request: m.StatusRequest, _now: float) -> None:
-        self._send(sender, status(self))
-
-    def _bye(self, sender: str, bye: m.Bye, _now: float) -> None:
-        if bye.reason:
-            self.out.notes.append(("INFO", f"{sender} leaves: {bye.reason}"))
+    # Silence.
 
     def tick(self, now: float) -> None:
         """Name, once each, the UAVs that have been silent for some time, and go on without those silent for long."""
@@ -324,17 +316,20 @@ class Station:
         for i in roster.long_silent(self.roster, now, self.config.comms.lost_after):
             if self.flight is flight:  # else the first of them ended the episode
                 self.lose(flight, i)
-                self.go_on(flight)
+                self.early.accept(self, flight)
+                self.settle()
 
     def lose(self, flight: Flight, i: int) -> None:
         """Go on without a UAV for the rest of the episode."""
         self.roster[i].life = -1  # whoever comes back says hello first
+        self.early.drop(i)
         last = flight.lose(i)
         self.out.entries.append(entries.lost(flight, i))
         text = f"{uav_name(i)} is lost after tick {last} of episode {flight.episode}; the others go on without it"
         self.out.notes.append(("ERROR", text))
         for j in range(flight.N):
-            self._send(uav_name(j), m.Lost(flight.episode, i, last))
+            self.send(uav_name(j), m.Lost(flight.episode, i, last))
+        self._exchange(flight)
 
 
 _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {
@@ -343,8 +338,8 @@ _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {
     m.SampleRequest: Station._sample_request,
     m.PolicyPush: Station._policy_push,
     m.PolicyRequest: Station._policy_request,
-    m.Alive: Station._alive,
-    m.Beacon: Station._beacon,
-    m.StatusRequest: Station._status_request,
-    m.Bye: Station._bye,
+    m.Alive: relay.alive,
+    m.Beacon: relay.beacon,
+    m.StatusRequest: relay.status_request,
+    m.Bye: relay.bye,
 }

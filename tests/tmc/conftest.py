@@ -96,6 +96,8 @@ class Mission:
         self.table = TrackTable(self.N, self.T)
         self.seen: dict[tuple[int, int, int], tuple[np.ndarray[Any, Any], list[int]]] = {}
         self.entries: list[Entry] = []
+        self.safe, self.groups = 0, lambda: True
+        """How many of the entries are committed; whether the group commit falls after this message."""
         self.notes: list[tuple[str, str]] = []
         self.heard: list[tuple[str, m.Message]] = []
         """What the station was told, in order."""
@@ -104,7 +106,7 @@ class Mission:
         self.down: list[deque[m.Message]] = [deque() for _ in range(self.N)]
         self.home: set[int] = set()
         self.waits: dict[int, Waiting] = {}
-        self.asked = 0
+        self.asked = self.restarts = 0
         self.lives = [0] * self.N
         self.pilots: list[SpyPilot] = []
         for i in range(self.N):
@@ -128,10 +130,17 @@ class Mission:
         """The station takes a message; what it says to UAVs goes on the air. Returns all that it says."""
         self.heard.append((sender, message))
         self.station.handle(sender, message, 1.0)
-        self.station.committed()
+        return self.take()
+
+    def take(self) -> list[tuple[str, m.Message]]:
+        """Put on the air and keep what the station has to say and to journal."""
+        commits = self.groups()
+        if commits:
+            self.station.committed()
         out = self.station.out.take()
         self.entries += out.entries
         self.notes += out.notes
+        self.safe = len(self.entries) if commits else self.safe
         for name, answer in out.sends:
             if name.startswith("uav-"):
                 self.down[int(name[4:])].append(answer)
@@ -175,13 +184,19 @@ class Mission:
             answer = pilot.on_map(message)
         elif isinstance(message, m.Policy):
             pilot.on_policy(message)
+        elif isinstance(message, m.Lost):
+            pilot.on_lost(message)
+        elif isinstance(message, m.Welcome):
+            self.up[i].extend(pilot.missed(message.sequence))
         elif isinstance(message, m.End):
             self.home.add(i)
         elif isinstance(message, m.Beacon):
             tracks = pilot.airspace.tracks
             assert isinstance(tracks, RadioTracks)
             tracks.hear(message)
-        assert not isinstance(message, m.Error), message.text
+        if isinstance(message, m.Error):
+            assert self.restarts and message.code == "state", message.text
+            answer = m.Hello("uav", i, self.lives[i])
         if pilot.phase is Phase.ACT and pilot.t == self.T:
             pilot.note()
         if answer is not None:
@@ -210,6 +225,13 @@ class Mission:
         self.down[i].clear()
         self.pilots[i] = self._pilot(i)
         self.up[i].append(m.Hello("uav", i, self.lives[i]))
+
+    def restart(self, station: Station, entries: list[Entry]) -> None:
+        """The TMC is killed, and `station` goes on with these entries in its journal; what was on the air is lost."""
+        self.station, self.entries, self.safe = station, entries, len(entries)
+        self.restarts += 1
+        for queue in (*self.up, *self.down):
+            queue.clear()
 
     def steps(self, rng: Random | None = None, crash: float = 0.0) -> Iterator[tuple[str, int]]:
         """Let things happen until all UAVs are home, and yield after each; without `rng` in a fixed order.

@@ -231,6 +231,7 @@ def test_a_capacity_below_the_team_is_not_exceeded_in_silence(town: RoadMap) -> 
         return
     replay = Replay(world, Observer(world))
     for t in range(4):
-        zeros = np.zeros(5)
-        replay.add_row(1, t, zeros.astype("u2"), zeros.astype("u1"), zeros.astype("f4"), np.zeros(5, np.int64))
+        zeros = np.zeros((1, 5))
+        arrays = (zeros.astype("u2"), zeros.astype("u1"), zeros.astype("f4"), zeros.astype(np.int64))
+        replay.add_rows(1, t, *arrays, [True])
     assert len(replay) <= 3

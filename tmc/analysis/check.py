@@ -28,6 +28,7 @@ INVARIANTS: tuple[tuple[str, str, Law], ...] = (
     ("sequence", "numbers of a UAV's records, without gap or repeat", _of_records(flightlaws.sequence)),
     ("ticks", "ticks of a UAV's records, without gap or repeat", _of_records(flightlaws.ticks)),
     ("cadence", "ends of records with the ticks that they are due at", _of_records(flightlaws.cadence)),
+    ("lost", "who was lost with whose records end early", _of_records(flightlaws.lost)),
     ("moves", "cells with actions, blocks and the map", _of_records(flightlaws.moves)),
     ("blocks", "moves blocked by UAVs with those that hold the target", _of_records(flightlaws.blocks)),
     ("separation", "no two UAVs on one cell", _of_records(flightlaws.separation)),
@@ -63,7 +64,7 @@ class Row:
 
 @dataclass
 class Result:
-    """What came of a journal; `note` says that it was not closed."""
+    """What came of a journal; `note`: what is worth saying and breaks nothing."""
 
     path: Path
     rows: list[Row]
@@ -115,7 +116,8 @@ def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) ->
         result.episodes += 1
         result.unfinished += not e.ended
         show(f"checked episode {e.number}", e.number / world.config.training.episodes)
-    _judge_file(log, result, notes)
+    _judge_file(log, result)
+    result.note += "".join(f"; {note}" for note in notes)
     if not result.episodes:
         rows[0].violation = Violation(None, None, None, "there is none: nothing was flown, or nothing of it is left")
     return result
@@ -131,11 +133,12 @@ def _sound(log: Log, row: Row) -> Iterator[Entry]:
         row.violation = Violation(None, None, None, str(error))
 
 
-def _judge_file(log: Log, result: Result, notes: list[str]) -> None:
+def _judge_file(log: Log, result: Result) -> None:
     """Damage, and what is known to be lost; a journal that a kill cut off, or that still grows, is good as it is."""
     left = log.path.name.endswith(ACTIVE) and log.cut
     lost = log.lost.get("lost")
-    faults = [*notes, *([log.damage] if log.damage and not left else []), *([f"lost: {lost}"] if lost else [])]
+    faults = [log.damage] if log.damage and not left else []
+    faults += [f"lost: {lost}"] if lost else []
     if faults and result.rows[0].violation is None:
         result.rows[0].violation = Violation(None, None, None, "; ".join(faults))
     result.note = "; the file was not closed" if left else ""

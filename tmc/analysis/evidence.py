@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,8 +15,6 @@ from tmc.record.reader import Entry
 
 UNKNOWN = -1
 """In arrays by tick and UAV: no record tells."""
-LOST = re.compile(r"uav-(\d+) is lost after tick -?\d+ of episode (\d+)")
-"""What the TMC says on /log when the team goes on without a UAV."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +35,15 @@ class Record:
 
 @dataclass
 class Sync:
-    """One exchange. `reported`: the tick of each UAV's last record before it; `last_visit`: the map logged with it."""
+    """One exchange. `reported`: the tick of each UAV's last record before it; `lost`: the UAVs that were lost by then;
+    `last_visit`: the map logged with it."""
 
     tick: int
     version: int
     uavs: list[int]
     believed: float
     reported: list[int]
+    lost: frozenset[int]
     last_visit: NDArray[np.uint32] | None = None
 
 
@@ -76,7 +75,8 @@ class Evidence:
 
     `cells`, `actions`, `blocks`: shape (T + 1, N), int64, UNKNOWN where no record tells; `own`: the rewards in records,
     shape (T + 1, N), float64, NaN there. A move is found at the tick at which it ends. `seen`: by UAV, the ticks and
-    cells of its sightings. `strange`: what makes no sense: (tick, UAV, why).
+    cells of its sightings. `lost`: UAV, and the tick of its last record, as told and as it was then. `strange`: what
+    makes no sense: (tick, UAV, why).
     """
 
     def __init__(self, world: World, number: int, before: Before) -> None:
@@ -92,7 +92,7 @@ class Evidence:
         self.events: list[tuple[int, int]] = []
         self.begins: list[Any] = []
         self.ends: list[Any] = []
-        self.noted_lost: set[int] = set()
+        self.lost: list[tuple[int, int, int]] = []
         self.strange: list[tuple[int | None, int | None, str]] = []
         self.reported = [-1] * self.N
         self.last = True
@@ -109,12 +109,11 @@ class Evidence:
 
 
 class Gathering:
-    """Sorts the messages of a journal by episode; `noted`: (episode, UAV) that were declared lost."""
+    """Sorts the messages of a journal by episode."""
 
     def __init__(self, world: World) -> None:
         self.world, self.before = world, Before()
         self.episode: Evidence | None = None
-        self.noted: set[tuple[int, int]] = set()
 
     def episodes(self, entries: Iterable[Entry]) -> Iterator[Evidence]:
         """One after the other, as soon as the next one begins."""
@@ -126,8 +125,6 @@ class Gathering:
                     yield done
                 if self.episode is not None:
                     _TAKERS[name](self, self.episode, entry.message)
-            elif name == "foxglove.Log":
-                self._log(entry.message.message)
         if self.episode is not None:
             yield self.episode
 
@@ -144,10 +141,11 @@ class Gathering:
         self.episode = Evidence(self.world, number, self.before.copy())
         return done
 
-    def _log(self, text: str) -> None:
-        found = LOST.search(text)
-        if found and self.episode is not None and int(found[2]) == self.episode.number:
-            self.episode.noted_lost.add(int(found[1]))
+    def _lost(self, e: Evidence, m: Any) -> None:
+        if m.uav < e.N:
+            e.lost.append((m.uav, m.tick, e.reported[m.uav]))
+        else:
+            e.strange.append((None, m.uav, f"it is lost, and there is none of that number in a team of {e.N}"))
 
     def _record(self, e: Evidence, m: Any) -> None:
         strange = misfit(e, m)
@@ -167,7 +165,9 @@ class Gathering:
         e.seen[i][1].extend(m.seen_cell[:])
 
     def _sync(self, e: Evidence, m: Any) -> None:
-        e.syncs.append(Sync(m.tick, m.version, m.uavs[:], m.believed, list(e.reported)))
+        e.syncs.append(
+            Sync(m.tick, m.version, m.uavs[:], m.believed, list(e.reported), frozenset(i for i, *_ in e.lost))
+        )
         self.before.version = m.version
 
     def _grid(self, e: Evidence, m: Any) -> None:
@@ -212,6 +212,7 @@ def misfit(e: Evidence, m: Any) -> str:
 
 _TAKERS: dict[str, Callable[[Gathering, Evidence, Any], None]] = {
     "overfly.FlightRecord": Gathering._record,
+    "overfly.Lost": Gathering._lost,
     "overfly.Sync": Gathering._sync,
     "foxglove.Grid": Gathering._grid,
     "overfly.TeamMetrics": Gathering._metrics,

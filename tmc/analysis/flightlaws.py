@@ -82,6 +82,20 @@ def cadence(e: Evidence) -> Found:
     return judged(e, len(e.records), faults)
 
 
+def lost(e: Evidence) -> Found:
+    """A UAV is lost once, after its last record; and whoever's records do not reach the episode's end is lost."""
+    faults: list[Fault] = []
+    told = [i for i, *_ in e.lost]
+    for i, tick, reported in e.lost:
+        if tick != reported or e.reported[i] != reported:
+            faults.append((tick, i, f"it is lost after tick {tick}; its records end at tick {e.reported[i]}"))
+        if told.count(i) > 1:
+            faults.append((tick, i, "it is lost twice"))
+    missing = [i for i in range(e.N) if e.reported[i] < e.T and i not in told]
+    faults += [(e.reported[i], i, "its records end here, and it was not lost") for i in missing if e.ended]
+    return judged(e, e.N, faults)
+
+
 def moves(e: Evidence) -> Found:
     """Each cell follows from the one before by the action, or is the same where the move was blocked; edges, obstacles
     and no-fly cells block, and nothing else but a UAV does."""

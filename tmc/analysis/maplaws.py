@@ -21,26 +21,19 @@ def exchanges(e: Evidence, _truth: Truth) -> Found:
     faults: list[Fault] = [(b, None, f"an exchange at tick {b} follows one at {a}")
                            for a, b in pairwise(held) if b <= a]  # fmt: skip
     for s in e.syncs:
-        due = [i for i in range(e.N) if e.world.config.due(i, s.tick)]
-        ready = [i for i in due if s.reported[i] >= s.tick]
-        if s.uavs != [i for i in ready if i in s.uavs or not _maybe_lost(e, i, s.tick)]:
-            faults.append((s.tick, None, f"UAVs {s.uavs} are answered, {ready} have shipped what was due"))
-        faults += [(s.tick, i, "it is not waited for, and flies on") for i in due if i not in ready
-                   and e.reported[i] >= s.tick]  # fmt: skip
+        due = [i for i in range(e.N) if i not in s.lost and e.world.config.due(i, s.tick)]
+        if s.uavs != due:
+            faults.append((s.tick, None, f"UAVs {s.uavs} are answered, {due} are due"))
+        faults += [(s.tick, i, "its record is not waited for") for i in due if s.reported[i] < s.tick]
     faults += [(t, None, "no exchange is held, and UAVs were due") for t in _needed(e) - set(held)]
     return judged(e, len(e.syncs), faults)
 
 
-def _maybe_lost(e: Evidence, i: int, tick: int) -> bool:
-    """A UAV may be lost between its record and the answer to it."""
-    return e.reported[i] == tick and (tick < e.T or i in e.noted_lost)
-
-
 def _needed(e: Evidence) -> set[int]:
     """Ticks of exchanges that must have been held: some UAV has flown on from there, or the episode is over."""
-    config = e.world.config
-    farthest = [e.reported[i] + (e.ended and e.reported[i] == e.T and i not in e.noted_lost) for i in range(e.N)]
-    return {t for i in range(e.N) for t in range(max(farthest[i], 0)) if config.due(i, t)}
+    lost, config = {i for i, *_ in e.lost}, e.world.config
+    upto = [e.T + 1 if e.ended and i not in lost else max(e.reported[i], 0) for i in range(e.N)]
+    return {t for i in range(e.N) for t in range(upto[i]) if config.due(i, t)}
 
 
 def versions(e: Evidence, _truth: Truth) -> Found:

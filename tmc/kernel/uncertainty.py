@@ -34,6 +34,7 @@ class UncertaintyLaw:
         rates, rate_of = np.unique(alpha[self.cells], return_inverse=True)
         self._decay = np.exp(-rates[:, None] * np.arange(ticks + 1)[None, :]).ravel()
         self._offset = rate_of.astype(np.int64) * (ticks + 1)
+        self._offsets: list[int] = self._offset.tolist()
 
     def values(
         self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64], s: NDArray[np.float64] | None = None
@@ -49,7 +50,7 @@ class UncertaintyLaw:
 
     def value(self, i: int, last_visit: int, t: int, s: NDArray[np.float64] | None = None) -> float:
         """u of the one cell `cells[i]`; the same bits as `values`."""
-        left = float(self._decay[self._offset[i] + t - last_visit])
+        left: float = self._decay.item(self._offsets[i] + t - last_visit)
         if s is not None and last_visit == 0:
             left = float(s[i]) * left
         return 1.0 - left

@@ -31,13 +31,20 @@ def left_behind(path: Path, resume: bool) -> Path | None:
 
 def open_held(path: Path, mode: str) -> Any:
     """Open a log and keep other writers away from it until it is closed; RecordError when one has it already."""
-    file: IO[bytes] = path.open(mode)
+    file: IO[bytes] = open(path, mode, opener=_whole)  # noqa: SIM115  whoever asked for it closes it
     try:
         _hold(file, path)
+        if mode == "wb":
+            file.truncate(0)
     except BaseException:
         file.close()
         raise
     return file
+
+
+def _whole(name: str, flags: int) -> int:
+    """Opens without cutting the file: it may be somebody else's."""
+    return os.open(name, flags & ~os.O_TRUNC, 0o666)
 
 
 def _hold(file: IO[bytes], path: Path) -> None:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +90,13 @@ class Log:
 
     @property
     def lost(self) -> dict[str, str]:
-        """What is missing in a file that was recovered from a damaged one (`overfly log recover`); empty otherwise."""
-        found = (item for item in self._items() if isinstance(item, Metadata) and item.name == RECOVERED)
-        return {key: value for item in found for key, value in item.metadata.items()}
+        """What is missing in a file that was recovered from a damaged one (`overfly log recover`); empty otherwise.
+
+        It stands before the first chunk, so no more than that is read.
+        """
+        head = takewhile(lambda item: not isinstance(item, list), self._items())
+        told = [item.metadata for item in head if isinstance(item, Metadata) and item.name == RECOVERED]
+        return {key: "; ".join(facts[key] for facts in told) for key in (told[0] if told else {})}
 
     def attachments(self) -> list[Attachment]:
         """The files within the file: name, media_type, data."""

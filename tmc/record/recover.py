@@ -40,7 +40,7 @@ class Recovery:
             yield f"{self.path}: sound and finished, {found.messages:,} messages; there is nothing to do"
             return
         yield f"{self.path}: {found.messages:,} messages are sound; they are in {self.out}"
-        yield from (f"  {note}; made anew" for note in found.notes)
+        yield from (f"  {note}" for note in found.notes)
         yield from (f"  lost {part}" for part in losses(found))
         if self.clean:
             yield "  nothing is lost" + ("" if found.finished else "; it was not closed")

@@ -49,9 +49,7 @@ def salvage(path: Path, what: str = "", show: Show = unseen) -> tuple[Findings, 
     except OSError as error:
         raise RecordError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
     except ValueError:  # mmap knows no empty files
-        raise RecordError(
-            f"{path} is empty: its process was killed before it wrote, so remove it, nothing is lost"
-        ) from None
+        raise RecordError(f"{path} is empty: its process was killed before it wrote; remove it") from None
     scan = _Scan(data, found, path.suffix != ".mcap", lambda share: show(f"{what} {path.name}", share))
     return found, scan.items()
 
@@ -198,7 +196,7 @@ class _Scan:
         if len(body) != 4 or self._next(at + 1) < self.size:
             raise UnsoundError("it says that it ends, and goes on")
         if not dry:
-            self.found.notes.append("its summary is damaged or cut")
+            self.found.notes.append("its summary is damaged or cut, and made anew")
             self._finish(at)
 
     def _finish(self, at: int) -> None:
@@ -207,9 +205,11 @@ class _Scan:
         with memoryview(self.data) as view:
             crc = zlib.crc32(view[:at])
         if head != HEAD.pack(Opcode.DATA_END, 4):
-            self.found.notes.append("the record that ends its data is damaged")
+            self.found.notes.append("the record that ends its data is damaged, and made anew")
         elif int.from_bytes(stated, "little") not in (0, crc) and not self.found.lost:
-            self.found.notes.append("its header, its metadata or an index are damaged, which have no CRC of their own")
+            self.found.notes.append(
+                "what has no CRC of its own is damaged: an index, made anew, or header or metadata, taken as found"
+            )
         self.found.finished = True
 
     def _summary(self) -> int:

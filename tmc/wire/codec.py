@@ -136,7 +136,7 @@ def _frame(rest: Any, name: str, shape: Any, rule: fields.Rule) -> Any:
 
 
 def _array(raw: Any, name: str, rule: fields.Rule) -> Any:
-    dtype = np.dtype(rule.dtype)
+    dtype = rule.numpy
     if not isinstance(raw, bytes) or len(raw) % dtype.itemsize:
         raise CodecError("malformed", f"{name} must be bytes of {rule.dtype} entries")
     return np.frombuffer(raw, dtype)

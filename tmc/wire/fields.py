@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 FRAME_LIMIT = 64 * 1024 * 1024
 """Largest frame, bytes: what a socket takes (tmc.wire.sockets)."""
+FEW = 64
 
 
 class FieldError(ValueError):
@@ -31,6 +33,11 @@ class Rule:
     choices: tuple[str, ...] = ()
     dtype: str = ""
     ndim: int = 1
+
+    @cached_property
+    def numpy(self) -> np.dtype[Any]:
+        """The dtype of an array or a tensor."""
+        return np.dtype(self.dtype)
 
 
 def _field(rule: Rule, default: Any = dataclasses.MISSING) -> Any:
@@ -86,14 +93,10 @@ def rules(cls: type) -> dict[str, Rule]:
 def check(message: Any) -> None:
     """Raise FieldError at the first field that breaks its rule."""
     for name, rule in rules(type(message)).items():
-        problem = _problem(getattr(message, name), rule)
+        problem = _CHECKS[rule.kind](getattr(message, name), rule)
         if problem:
             code = "range" if problem.startswith("is out of") else "malformed"
             raise FieldError(code, f"{type(message).__name__}.{name} {problem}")
-
-
-def _problem(value: Any, rule: Rule) -> str:
-    return _CHECKS[rule.kind](value, rule)
 
 
 def _int(value: Any, rule: Rule) -> str:
@@ -123,13 +126,18 @@ def _bytes(value: Any, rule: Rule) -> str:
 
 
 def _array(value: Any, rule: Rule) -> str:
-    if not isinstance(value, np.ndarray) or value.dtype != np.dtype(rule.dtype) or value.ndim != rule.ndim:
+    if not isinstance(value, np.ndarray) or value.dtype != rule.numpy or value.ndim != rule.ndim:
         return f"must be an array of {rule.dtype} with {rule.ndim} dimension(s)"
     if value.size > rule.high:
         return f"is out of range: {value.size} entries, at most {int(rule.high)}"
-    if value.dtype.kind == "f" and not np.isfinite(value).all():
+    if rule.numpy.kind == "f" and not _all_finite(value):
         return "is out of range: it holds a value that is not finite"
     return ""
+
+
+def _all_finite(value: Any) -> bool:
+    """A flight record has some ten entries, for which NumPy's calls cost more than plain Python."""
+    return all(map(math.isfinite, value.ravel().tolist())) if value.size <= FEW else bool(np.isfinite(value).all())
 
 
 _CHECKS = {"int": _int, "float": _float, "str": _str, "bytes": _bytes, "array": _array, "tensor": _array}

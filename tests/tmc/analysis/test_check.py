@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from actors.airspace import Waiting
 from deploy.lockstep import LockStep
 from tmc.analysis.check import FILE, INVARIANTS, Result, check
 from tmc.journal import Journal as TmcJournal
-from tmc.kernel.config import Journal, build
+from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
@@ -71,6 +72,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
     config = build({"team.pilot": "planner:greedy", "team.size": 4, "training.ticks": 60, "training.episodes": 3,
                     "comms.period": 7, "training.seed": 5, **values})  # fmt: skip
     folder.mkdir()
+    (folder / "config.json").write_text(json.dumps(flat(config)))
     world = World(config)
     journal = TmcJournal(folder, world, "lost")
     step = LockStep(world, None, journal.take)
@@ -120,10 +122,12 @@ def test_a_journal_with_a_lost_uav_passes(
 ) -> None:
     monkeypatch.setattr("actors.pilot.STINT", 1)  # it is seen in places that its records do not tell of
     folder = lose_one(tmp_path / "run", dies, scenario=scenario, **{"comms.phase": phase})
-    assert any("is lost after tick" in e.message.message for e in Log(folder / "tmc.mcap").entries(["/log"]))
+    assert [e.message.uav for e in Log(folder / "tmc.mcap").entries(["/tmc/lost"])] == [2, 2]
     result = check(folder)
     assert broken(result) == {}
     assert result.episodes == 3
+    for n, make in enumerate((drop("/tmc/lost", episode=1), once("/tmc/lost", plus("tick", 1)))):
+        assert "lost" in broken(check(altered(folder, tmp_path / f"altered-{n}", make())))
 
 
 @pytest.mark.parametrize("share", [0.1, 0.35, 0.6, 0.9, 0.99])
@@ -374,6 +378,7 @@ BREAKS: list[tuple[str, dict[str, object], Callable[..., Change], str]] = [
     ("ticks", CROWD, record_twice, ONLY),
     ("ticks", CROWD, drop("/uav/3/record", episode=1, tick=20), ""),
     ("cadence", CROWD, record_split, ONLY),
+    ("lost", CROWD, drop("/uav/3/record", episode=2, tick=60), ""),
     ("moves", CROWD, once("/record", stay_instead), ONLY),
     ("moves", CROWD, once("/record", plus("cells", 1, 3), tick=20), ""),
     ("blocks", CROWD, other_blocked_action, ONLY),
@@ -428,7 +433,7 @@ def test_the_first_violation_is_named(fly: Fly, tmp_path: Path) -> None:
     assert violation.startswith("episode 1, tick 15, UAV 3: it reckons ")
     row = next(line for line in check(folder).table() if line.startswith("own rewards"))
     assert "VIOLATED: episode 1, tick 15, UAV 3" in row
-    assert "1 of 20 invariants are violated" in check(folder).summary()
+    assert "1 of 21 invariants are violated" in check(folder).summary()
 
 
 @pytest.mark.parametrize(

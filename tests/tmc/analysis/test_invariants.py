@@ -29,6 +29,8 @@ NO_FACTS = frozenset((
     "life", "policy", "updates", "epsilon",  # how the flight came about
     "timestamp", "frame_id", "pose", "cell_size", "fields",  # how a map is drawn
 ))  # fmt: skip
+TOPICS = ("/uav/", "/tmc/sync", "/tmc/episode", "/tmc/events", "/tmc/metrics", "/tmc/last_visit")
+"""What is checked: the digests of `/tmc/state` are for whoever plays the journal."""
 FLOATS = (1, 2)
 """Kinds of protobuf fields: double and float."""
 
@@ -45,7 +47,7 @@ def violated(world: World, entries: list[Entry]) -> set[str]:
 @cache
 def journal(folder: Path) -> tuple[World, list[Entry]]:
     world, _ = world_of(folder, folder / "tmc.mcap")
-    entries = [e for e in Log(folder / "tmc.mcap").entries() if e.topic.startswith(("/tmc/", "/uav/"))]
+    entries = [e for e in Log(folder / "tmc.mcap").entries() if e.topic.startswith(TOPICS)]
     assert violated(world, entries) == set()
     return world, entries
 

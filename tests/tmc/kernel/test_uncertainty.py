@@ -270,3 +270,14 @@ def test_bound_falls_with_the_team_and_is_zero_when_every_cell_has_a_uav() -> No
     bounds = [lower_bound(alpha, n, 30) for n in range(1, 13)]
     assert all(b < a for a, b in pairwise(bounds))
     assert bounds[-1] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("cells", [1, 7, 8, 129, 322, 1000])
+def test_sums_have_the_same_bits_however_many_ticks_are_reckoned_at_once(cells: int) -> None:
+    """The TMC reckons as many ticks as have come in; a log must not show how many those were."""
+    law = UncertaintyLaw(np.random.default_rng(cells).choice([0.01, 0.2, 0.003], cells), 64)
+    maps = np.random.default_rng(1).integers(0, 10, (54, cells)).astype(np.uint16)
+    ticks = np.arange(10, 64)
+    together = law.values(maps, ticks[:, None]).sum(axis=1).tolist()
+    assert together == [float(law.values(row, t).sum()) for row, t in zip(maps, ticks.tolist(), strict=True)]
+    assert together[3:5] == law.values(maps[3:5], ticks[3:5, None]).sum(axis=1).tolist()

@@ -261,7 +261,7 @@ def test_topics_that_only_a_lost_chunk_described_are_not_guessed(wholes: dict[bo
 def test_a_damaged_summary_is_made_anew_and_nothing_is_lost(wholes: dict[bool, Whole], tmp_path: Path) -> None:
     for data in (wholes[True].data[:-30], wholes[True].data[:-30] + bytes(30), wholes[True].data + b"more"):
         result = recover(write(tmp_path, wholes[True], data), tmp_path / f"{len(data) % 97}.mcap")
-        assert result.clean and "summary is damaged or cut; made anew" in "\n".join(result.lines())
+        assert result.clean and "summary is damaged or cut, and made anew" in "\n".join(result.lines())
         assert result.out is not None and messages_of(result.out) == wholes[True].messages
         result.out.unlink()
 
@@ -272,6 +272,21 @@ def test_in_place_keeps_the_damaged_file_and_gives_the_finished_name(wholes: dic
     assert not result.clean and result.out == tmp_path / "tmc.mcap"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tmc.mcap", "tmc.mcap.active.damaged-1"]
     assert (tmp_path / "tmc.mcap.active.damaged-1").read_bytes() == wholes[False].data[:-7]
+
+
+def test_what_is_lost_in_two_recoveries_is_told_of_both(wholes: dict[bool, Whole], tmp_path: Path) -> None:
+    whole, said = wholes[False], list[str]()
+    path, at = write(tmp_path, whole, whole.data), whole.chunks[4][0] + 60
+    for n in range(2):
+        data = bytearray(path.read_bytes())
+        data[at] ^= 1
+        path.write_bytes(data)
+        result = recover(path, tmp_path / f"{n}.mcap")
+        assert result.out is not None
+        path, at = result.out, result.out.read_bytes().find(b"\x04\x00\x00\x00zstd") + 30
+        said += map(str, result.found.lost)
+    assert len(said) == 2 and all(part in Log(path).lost["lost"] for part in said)
+    assert Log(path).damage is None and recover(path).out is None
 
 
 def test_a_recovered_log_is_resumed_with_its_gap(wholes: dict[bool, Whole], tmp_path: Path) -> None:

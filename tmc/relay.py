@@ -1,0 +1,41 @@
+"""What the TMC passes on, notes or answers while the mission stays as it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tmc.roster import uav_name
+from tmc.status import status
+from tmc.wire import messages as m
+
+if TYPE_CHECKING:
+    from tmc.station import Station
+
+
+def beacon(station: Station, sender: str, message: m.Beacon, _now: float) -> None:
+    """A UAV tells its peers where it was."""
+    if uav_name(message.uav) != sender:
+        station.reject(sender, "refused", f"{sender} cannot send a beacon of UAV {message.uav}")
+        return
+    for i in message.to.tolist():
+        if i < len(station.roster) and i != message.uav:
+            station.send(uav_name(i), message)
+
+
+def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
+    """A UAV is slow, not lost."""
+    if 0 <= message.uav < len(station.roster) and sender == uav_name(message.uav):
+        member = station.roster[message.uav]
+        if message.life == member.life:
+            member.heard, member.named = now, False
+
+
+def status_request(station: Station, sender: str, _request: m.StatusRequest, _now: float) -> None:
+    """Somebody wants to know how far the mission is."""
+    station.send(sender, status(station))
+
+
+def bye(station: Station, sender: str, message: m.Bye, _now: float) -> None:
+    """A client leaves in order."""
+    if message.reason:
+        station.out.notes.append(("INFO", f"{sender} leaves: {message.reason}"))
