@@ -49,8 +49,8 @@ def missions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 FOLDERS = {
-    "finished": ("trained", "flown"),
-    "made": ("made",),
+    "finished": ("trained", "flown", "losing"),
+    "made": ("made", "sealed"),
     "resumed": ("resumed-killed", "resumed-cut"),
     "recovered": ("recovered-killed", "recovered-cut"),
 }

@@ -1,4 +1,4 @@
-"""Real logs for the readers: two missions that ended in order, and one whose processes were all killed in flight."""
+"""Real logs for the readers: missions that ended in order, in one of which a UAV was lost, and one killed in flight."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ TRAINED = ("run", "quick", "--scenario", "1", "--ticks", "60", "--episodes", "2"
 FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60")
 # Slow enough to be still in flight when all have written.
 KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", *SMALL)
+LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--set", "trial.stall=0.03",
+          "--set", "comms.patience=0.5", "--set", "comms.lost_after=1", "--set", "journal.flush=0.1")  # fmt: skip
 WRITERS = ("tmc", "learner", "uav-000", "uav-001")
 _COMMAND = (sys.executable, "-P", "-m", "deploy.cli")
 
@@ -31,9 +33,13 @@ def make(folder: Path) -> None:
     for name, mission in (("trained", TRAINED), ("flown", FLOWN)):
         done = overfly(*mission, "--out", folder / name)
         assert done.returncode == 0, done.stderr
+    lose_one(folder / "losing")
     for view in ("merge", "replay"):
         done = overfly("log", view, folder / "flown", "--out", folder / "made" / f"{view}.mcap")
         assert done.returncode == 0, done.stderr
+    shutil.copytree(folder / "trained", folder / "sealed")
+    done = overfly("log", "seal", folder / "sealed")
+    assert done.returncode == 0, done.stderr
     kill_in_flight(folder / "killed")
     cut(folder / "killed" / f"tmc.mcap{ACTIVE}", folder / "cut")
     for left in (folder / "killed", folder / "cut"):
@@ -69,6 +75,19 @@ def recover(left: Path, folder: Path) -> None:
 def _copies(left: Path, folder: Path) -> list[Path]:
     folder.mkdir()
     return [Path(shutil.copy(path, folder)) for path in sorted(left.glob(f"*{ACTIVE}"))]
+
+
+def lose_one(out: Path) -> None:
+    """A flight in which one of two UAVs falls silent for so long that the other goes on without it."""
+    with subprocess.Popen([*_COMMAND, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
+        _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
+        (silent,) = (
+            p for p in _descendants(run.pid) if b"--id\0001\0" in (Path("/proc") / str(p) / "cmdline").read_bytes()
+        )
+        os.kill(silent, signal.SIGSTOP)
+        time.sleep(3)
+        os.kill(silent, signal.SIGCONT)
+        assert run.wait(60) == 0
 
 
 def kill_in_flight(out: Path) -> None:
