@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +34,8 @@ SILENCE = (0.25, 1.0)
 """Seconds after which a message that was not answered goes out again: at first, and at most; doubles in between."""
 STATUS_EVERY = 0.5
 """Seconds between two status messages in the log."""
+TELL_EVERY = 5.0
+"""Seconds between two lines that say that no TMC answers."""
 NAP = 0.02
 """Seconds that a wait for a peer's track sleeps before it looks at what the TMC sent; ten times as long in a long wait,
 which costs less than 1 % of a core."""
@@ -50,7 +53,7 @@ class Service:
     """UAV `uav` of the mission that the TMC at `endpoint` runs; logs to `out`."""
 
     def __init__(self, uav: int, endpoint: str, out: Path) -> None:
-        self.uav, self.out = uav, out
+        self.uav, self.endpoint, self.out = uav, endpoint, out
         self.life = int.from_bytes(os.urandom(7), "big")
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, endpoint, f"uav-{uav:03d}")
@@ -85,8 +88,11 @@ class Service:
 
     def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
         """Say hello until the TMC answers, and build the pilot of the mission that it names."""
-        hello = m.Hello("uav", self.uav, self.life)
+        hello, told = m.Hello("uav", self.uav, self.life), time.monotonic()
         while not stop():
+            if time.monotonic() - told > TELL_EVERY:
+                told = time.monotonic()
+                print(f"overfly: UAV {self.uav} waits for a TMC at {self.endpoint}", file=sys.stderr, flush=True)
             self.say(hello)
             if self.sock.poll(int(SILENCE[0] * 1000)):
                 message = self._receive()

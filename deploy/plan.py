@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import deploy
 from actors.planners import PREFIX
 from tmc.kernel.config import Config
 
+SCRATCH, HELD = "overfly-", "held"
+"""How the names of the folders begin that the processes of a mission share, and the file in each."""
 ROOT = Path(deploy.__file__).resolve().parent.parent
 """The folder that holds the four packages."""
 
@@ -32,13 +38,17 @@ class Child:
 
 @dataclass(frozen=True)
 class Plan:
-    """The processes of a mission on this machine, and what they share. `preload`: what all UAVs import."""
+    """The processes of a mission on this machine, and what they share. `preload`: what all UAVs import.
+
+    `held`: a file in `scratch`, locked for as long as it is open.
+    """
 
     children: tuple[Child, ...]
     endpoint: str
     tracks: Path
     scratch: Path
     preload: tuple[str, ...] = ()
+    held: IO[bytes] | None = None
 
 
 def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) -> Plan:
@@ -46,7 +56,7 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
 
     `table`: the UAVs share a table of tracks; otherwise they tell each other by beacon.
     """
-    scratch = Path(tempfile.mkdtemp(prefix="overfly-", dir=_short_folder()))
+    scratch, held = _new_scratch()
     endpoint, tracks = f"ipc://{scratch}/sync", scratch / "tracks"
     flies_fixed = policy is not None or config.team.pilot != "policy"
     common = ("--parent", str(os.getpid()), "--out", str(out))
@@ -61,7 +71,23 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
         children.append(Child(f"uav-{i:03d}", command, restart=True, forked=True))
     # A planner flies without ONNX Runtime, 16 MB of memory that nobody would use.
     preload = () if config.team.pilot.startswith(PREFIX) else ("actors.policy",)
-    return Plan(tuple(children), endpoint, tracks, scratch, preload)
+    return Plan(tuple(children), endpoint, tracks, scratch, preload, held)
+
+
+def _new_scratch() -> tuple[Path, IO[bytes]]:
+    """A folder for what the processes share, and the file in it that is held while its supervisor lives.
+
+    The folders of supervisors that were killed are removed: nobody holds their files any more.
+    """
+    for old in Path(_short_folder() or tempfile.gettempdir()).glob(f"{SCRATCH}*/{HELD}"):
+        with suppress(OSError), old.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(old.parent)
+    scratch = Path(tempfile.mkdtemp(prefix=SCRATCH, dir=_short_folder()))
+    held = (scratch / ".new").open("wb")
+    fcntl.flock(held, fcntl.LOCK_EX)
+    (scratch / ".new").rename(scratch / HELD)
+    return scratch, held
 
 
 def _module(name: str) -> tuple[str, ...]:

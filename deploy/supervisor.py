@@ -155,3 +155,5 @@ class Supervisor:
         self._forkserver.close()
         with contextlib.suppress(OSError):
             shutil.rmtree(self.plan.scratch)
+        if self.plan.held is not None:
+            self.plan.held.close()

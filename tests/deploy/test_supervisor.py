@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,8 +15,9 @@ import pytest
 
 from deploy import supervisor as supervisors
 from deploy.forked import Forked, ForkServer
-from deploy.plan import Child, Plan
+from deploy.plan import Child, Plan, make
 from deploy.supervisor import MissionFailed, Supervisor
+from tmc.kernel.config import build
 from tmc.wire import process
 
 ROOT = Path(__file__).parents[2]
@@ -178,3 +180,18 @@ time.sleep(60)
     while any(alive(pid) for pid in pids):
         assert time.monotonic() < until, "a process outlived its supervisor"
         time.sleep(0.02)
+
+
+def test_what_a_killed_supervisor_left_in_memory_is_removed_by_the_next(tmp_path: Path) -> None:
+    config = build({"team.pilot": "planner:random"})
+    living, dead = make(config, tmp_path, policy=None), make(config, tmp_path, policy=None)
+    assert living.held is not None and dead.held is not None
+    try:
+        dead.held.close()  # as a kill does
+        after = make(config, tmp_path, policy=None)
+        assert living.scratch.exists() and after.scratch.exists() and not dead.scratch.exists()
+        shutil.rmtree(after.scratch)
+        after.held.close()  # type: ignore[union-attr]
+    finally:
+        living.held.close()
+        shutil.rmtree(living.scratch)
