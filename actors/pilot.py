@@ -94,7 +94,7 @@ class Pilot:
         for uav in begin.lost.tolist():
             self.airspace.lose(uav)
         self._epsilon = self.config.epsilon(self.episode)
-        self._draws = self.world.explorations(self.episode, self.uav)
+        self._draws: list[list[float]] = self.world.explorations(self.episode, self.uav).tolist()
         self._factor = self.world.initial_factor(self.episode)
         self.last_visit = begin.last_visit.copy()
         self.active = np.zeros(self.world.grid.size, bool)
@@ -219,7 +219,7 @@ class Pilot:
     def sight(self) -> Sight:
         """What this UAV knows at t."""
         allowed = self.observer.allowed(self.cell, self.peers)
-        draw = float(self._draws[self.t, 1])
+        draw = self._draws[self.t][1]
         return Sight(self.t, self.cell, self.previous, self.peers, self.map_of(self.t), allowed, draw)
 
     def _act(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,7 +48,7 @@ def baselines(options: list[str]) -> dict[str, float]:
             found[name] = float(value)
         except ValueError:
             name = ""
-        if not name:
+        if not name or not math.isfinite(found[name]):
             raise ConfigError(f"--baseline {option} is no NAME=VALUE: write for example greedy=0.39")
     return found
 

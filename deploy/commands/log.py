@@ -97,11 +97,17 @@ def _when(time_ns: int | None) -> str:
 def _cat(args: argparse.Namespace) -> int:
     from google.protobuf.json_format import MessageToDict  # noqa: PLC0415  slow to import, used only here
 
+    wanted = set(args.topic or ())
     for path in _files(args.run).values():
         for entry in read(path, args.topic):
+            wanted.discard(entry.topic)
             body = MessageToDict(entry.message, preserving_proto_field_name=True)
             head = {"topic": entry.topic, "log_time": entry.log_time, "sequence": entry.sequence}
             print(json.dumps(head | {"message": body}))
+    if wanted:
+        raise RecordError(
+            f"{args.run} holds nothing on {', '.join(sorted(wanted))}: `overfly log info` lists its topics"
+        )
     return 0
 
 

@@ -66,7 +66,7 @@ def _complaints(config: Config) -> Iterator[str]:
     for key, low, high in RANGES:
         value = attrgetter(key)(config)
         if not low <= value <= high:
-            yield f"{key} = {value} is out of range: choose {low:g} to {high:g}"
+            yield f"{key} = {value} is out of range: choose {low:,.10g} to {high:,.10g}"
     if not config.network.channels or any(not 1 <= c <= 4096 for c in config.network.channels):
         yield "network.channels must list 1 to 4096 filters for at least one convolution"
     if config.replay.learn_start > config.replay.capacity:
