@@ -172,7 +172,7 @@ class Service:
         elif pilot.phase is Phase.POLICY:
             self.say(m.PolicyRequest(pilot.wanted))
         elif pilot.under_way:
-            self.say(m.Alive(self.uav, self.life, pilot.t, self._peer))
+            self.say(m.Alive(self.uav, self.life, pilot.t, self._peer, pilot.sequence))
         else:
             self.say(m.Hello("uav", self.uav, self.life))
 

@@ -24,6 +24,8 @@ from tmc.kernel.policy import check_view, view_shape
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
 from tmc.record import disk
+from tmc.record.errors import RecordError
+from tmc.record.seal import seal_log
 from tmc.wire import process
 
 POLL = 0.1
@@ -90,6 +92,15 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
     return check(build(values), policy), policy
 
 
+def finished(out: Path) -> bool:
+    """True when the processes of the run in `out` came to its end, all of them in order."""
+    try:
+        codes = json.loads((out / "run.json").read_text()).get("exit_codes", {})
+    except (OSError, ValueError, AttributeError):
+        return False
+    return set(codes.values()) == {0} and (out / "tmc.mcap").exists()
+
+
 class Mission:
     """One mission in its run folder; `world` comes from `check`."""
 
@@ -118,6 +129,7 @@ class Mission:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
             else:
                 self._fly()
+            self._seal()
         except MissionFailed as failed:
             self.progress.note(str(failed))
             return process.FAILED
@@ -147,6 +159,15 @@ class Mission:
             supervisor.stop()
             supervisor.close()
             self._ended = {"exit_codes": supervisor.exit_codes(), "restarts": supervisor.restarts()}
+
+    def _seal(self) -> None:
+        """Rewrite the journal of a mission that is over for keeping; its sizes are in `run.json`."""
+        try:
+            sealed = seal_log(self.out / "tmc.mcap", self.progress.work)
+        except RecordError as error:  # all of it is there, in small chunks
+            self.progress.note(f"the log stays as it was written: {error}")
+        else:
+            self._ended["sealed"] = {"before": sealed.before, "after": sealed.after}
 
     def _write_run(self, more: dict[str, Any]) -> None:
         """`run.json`: what was run, with which versions, and how each process ended."""

@@ -49,7 +49,7 @@ class Progress:
         self._tty = self._out.isatty()
         self._total = config.training.episodes * config.training.ticks
         self._past: list[tuple[float, int, int]] = []
-        self._next = self._width = 0.0
+        self._next = self._width = self._working = 0.0
 
     def show(self, status: m.Status) -> None:
         """Show a status, when it is time to."""
@@ -91,6 +91,14 @@ class Progress:
         now, ticks = self._past[-1][0], self._past[-1][1]
         before = [past for past in self._past if past[0] < now - 2]
         return bool(before) and before[-1][1] == ticks
+
+    def work(self, what: str, share: float) -> None:
+        """Show how much of something is done that comes after the flight, once it has taken some time."""
+        now = time.monotonic()
+        self._working = self._working or now
+        if now > max(self._next, self._working + 2.0):
+            self._next = now + (0.2 if self._tty else PLAIN_EVERY)
+            self._write(f"{what}: {share:.0%}")
 
     def note(self, text: str) -> None:
         """A line that stays."""

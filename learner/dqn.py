@@ -15,14 +15,21 @@ from torch.nn.functional import huber_loss
 def target(reward: Tensor, discount: Tensor, q_next: Tensor, allowed: Tensor, q_choice: Tensor | None = None) -> Tensor:
     """Eq. (12): y = r + gamma^n max_a' Q(o', a'; theta-). Shape (B,), no gradient.
 
-    `reward` (B,): r_{t+1} + gamma r_{t+2} + ... of n ticks, `discount` (B,): gamma^n; the paper has n = 1.
-    `q_next` (B, 9): Q(o_{t+n}, . ; theta-). `allowed` (B, 9): zero for the actions that the max leaves out.
-    With `q_choice` (B, 9) = Q(o_{t+n}, . ; theta), a' is the best by that instead: double Q-learning, not in the paper.
+    `reward` (B,): r_{t+1} + gamma r_{t+2} + ... of n ticks, `discount` (B,): gamma^n; the paper has n = 1. The other
+    arguments are those of `value`.
 
     There is no terminal term: an episode ends by a time limit, which is no state of the world, so y always bootstraps.
     """
-    best = permitted(q_next if q_choice is None else q_choice, allowed).argmax(dim=1)
-    return (reward + discount * of(q_next, best)).detach()
+    return (reward + discount * value(q_next, allowed, q_choice)).detach()
+
+
+def value(q_next: Tensor, allowed: Tensor, q_choice: Tensor | None = None) -> Tensor:
+    """max_a' Q(o', a'; theta-), what o' is worth. Shape (B,).
+
+    `q_next` (B, 9): Q(o_{t+n}, . ; theta-). `allowed` (B, 9): zero for the actions that the max leaves out.
+    With `q_choice` (B, 9) = Q(o_{t+n}, . ; theta), a' is the best by that instead: double Q-learning, not in the paper.
+    """
+    return of(q_next, permitted(q_next if q_choice is None else q_choice, allowed).argmax(dim=1))
 
 
 def permitted(q: Tensor, allowed: Tensor) -> Tensor:

@@ -30,6 +30,8 @@ def check(minibatch: Minibatch, shape: Shape) -> None:
         )
     if any(r.shape != (b,) for r in rows) or minibatch.allowed.shape != (b, N_ACTIONS):
         raise TrainingError(f"the minibatch's fields differ in length: each must have {b} rows")
+    if minibatch.index.shape != (b,) or int(minibatch.index.min()) < 0:
+        raise TrainingError(f"the minibatch's transitions are not numbered: `index` must have {b} numbers from 0 on")
     if int(minibatch.action.max()) >= N_ACTIONS:
         raise TrainingError(f"the minibatch has an action {minibatch.action.max()}: a UAV has {N_ACTIONS}")
     if not minibatch.allowed.any(axis=1).all():

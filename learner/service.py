@@ -94,7 +94,7 @@ class Service:
     def _own(self, run: str) -> None:
         """Refuse a folder with the checkpoints of another mission: the learner would go on from them."""
         mark = self.out / "learner.run"
-        if mark.exists() and mark.read_text().strip() != run:
+        if mark.exists() and not run.startswith(mark.read_text().strip()):  # a power cut may leave half of it
             raise EndpointError(f"{self.out} holds what was learned in another mission: choose another --out")
         self.out.mkdir(parents=True, exist_ok=True)
         mark.write_text(run + "\n")
@@ -121,7 +121,8 @@ class Service:
         if isinstance(message, m.Minibatch):
             self._ask()
             self._update(message)
-        elif isinstance(message, m.Welcome):  # a TMC that has lost our requests
+        elif isinstance(message, m.Welcome):  # a TMC that has lost our requests, and perhaps its numbers
+            self.trainer.forget()
             self.trainer.version = max(self.trainer.version, message.policy)
             self._push()
             for _ in range(WINDOW):

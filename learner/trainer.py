@@ -9,15 +9,18 @@ import copy
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from learner import dqn, qnet
 from learner.export import to_onnx
 from learner.intake import TrainingError, check, images
+from learner.known import Known
 from learner.qnet import QNet, Shape
 from tmc.kernel.config import Config
 from tmc.kernel.grid import Grid
+from tmc.kernel.observation import Floats
 from tmc.kernel.policy import card_for, view_shape
 from tmc.wire.messages import Minibatch
 
@@ -67,27 +70,41 @@ class Trainer:
         for p in self.online.parameters():  # as Adam does at its first step, so that `state` is whole before it
             zeros = {moment: torch.zeros_like(p) for moment in ("exp_avg", "exp_avg_sq")}
             self.adam.state[p] = {"step": torch.zeros(()), **zeros}
+        self._known = Known(config.replay.capacity)
 
     def update(self, minibatch: Minibatch) -> UpdateMetrics:
         """One step of Adam on eq. (9), and theta- = theta when that is due. Raises TrainingError."""
         check(minibatch, self.shape)
         self._follow(minibatch.episodes)
-        o, o_next = images(minibatch.observation), images(minibatch.next_observation)
-        y = self._target(minibatch, o_next)
+        y = self._target(minibatch)
         action = torch.tensor(minibatch.action, dtype=torch.int64)
-        metrics = self._step(self.online(o), action, y)
+        metrics = self._step(self.online(images(minibatch.observation)), action, y)
         every = self.config.dqn.target_updates
         if every and self.updates % every == 0:
             self._copy()
         return metrics
 
     @torch.no_grad()
-    def _target(self, minibatch: Minibatch, o_next: Tensor) -> Tensor:
-        """y of eq. (8), of scaled rewards."""
+    def _target(self, minibatch: Minibatch) -> Tensor:
+        """y of eq. (8), of scaled rewards: `dqn.target`, with what theta- is known to say of o' looked up."""
         reward = torch.tensor(minibatch.reward) * self.config.dqn.reward_scale
-        choice = self.online(o_next) if self.config.dqn.double else None
-        discount, allowed = torch.tensor(minibatch.discount), torch.tensor(minibatch.allowed)
-        return dqn.target(reward, discount, self.target(o_next), allowed, choice)
+        return reward + torch.tensor(minibatch.discount) * torch.from_numpy(self._values(minibatch))
+
+    def _values(self, minibatch: Minibatch) -> Floats:
+        """max_a' Q(o', a'; theta-) of each transition, computed only where it is not known. Shape (B,)."""
+        values, known = self._known.look_up(minibatch.index)
+        rest = np.flatnonzero(~known)
+        if rest.size:
+            o_next, allowed = images(minibatch.next_observation[rest]), torch.tensor(minibatch.allowed[rest])
+            choice = self.online(o_next) if self.config.dqn.double else None
+            values[rest] = dqn.value(self.target(o_next), allowed, choice).numpy()
+            if choice is None:  # a value that theta has chosen changes with every update
+                self._known.keep(minibatch.index[rest], values[rest])
+        return values
+
+    def forget(self) -> None:
+        """The numbers of transitions begin anew: what was known of them is of others."""
+        self._known.forget()
 
     def _step(self, q: Tensor, action: Tensor, y: Tensor) -> UpdateMetrics:
         """Descend the loss of `q` (B, 9) at `action` (B,) against `y` (B,)."""
@@ -118,6 +135,7 @@ class Trainer:
     def _copy(self) -> None:
         """theta- = theta."""
         self.target.load_state_dict(self.online.state_dict())
+        self._known.forget()
 
     def policy(self, after: int = 0) -> tuple[int, bytes]:
         """A policy file of theta, with a version newer than any before and than `after`."""
@@ -139,7 +157,9 @@ class Trainer:
 
     @torch.no_grad()
     def load(self, state: State) -> None:
-        """Become the trainer that gave `state`: the same minibatches then give the same weights, bit for bit.
+        """Become the trainer that gave `state`: the same minibatches then give the same weights.
+
+        Bit for bit, where they hold no transition that the other trainer still knew the value of; else within rounding.
 
         Raises ValueError, and changes nothing, when the state is of another network.
         """
@@ -149,6 +169,7 @@ class Trainer:
         for name, tensor in mine.items():  # in place: the fused Adam wants moments laid out as the weights are
             tensor.copy_(state.tensors[name])
         self.updates, self.version, self.copied = state.updates, state.version, state.copied
+        self._known.forget()
 
 
 def copy_due(finished: int, copied: int, f: int) -> bool:

@@ -38,11 +38,14 @@ class Feed:
         return True
 
     def serve(self, episodes: int, ticks: int) -> Iterator[Minibatch]:
-        """A minibatch for each request for which one is owed."""
-        while self._requests and self.limiter.owed:
+        """A minibatch for each request for which one is owed; none before the learner was welcomed.
+
+        A TMC that was started again may number its transitions anew, which a learner must hear first.
+        """
+        while self.life >= 0 and self._requests and self.limiter.owed:
             s = self.replay.sample(self.limiter.updates, self.batch)
             self.limiter.sample()
             yield Minibatch(
                 self._requests.pop(0), episodes, ticks, s.observation, s.action, s.reward,
-                s.next_observation, s.discount, s.allowed,
+                s.next_observation, s.discount, s.allowed, s.index,
             )  # fmt: skip

@@ -26,6 +26,7 @@ from tmc.roster import Member
 from tmc.station import Station
 
 Taker = Callable[[Station, Any, Path, float], None]
+EPISODE, POLICY = "overfly.Episode", "overfly.Policy"
 
 
 def recover(station: Station, path: Path, now: float) -> list[Entry]:
@@ -45,32 +46,48 @@ def recover(station: Station, path: Path, now: float) -> list[Entry]:
     return missing
 
 
-def play(station: Station, journal: Iterable[Raw], folder: Path, now: float, skip: range = range(0)) -> list[Entry]:
-    """Play the messages of a journal; returns those that follow from them and are not among them.
+def play(
+    station: Station,
+    journal: Iterable[Raw],
+    folder: Path,
+    now: float,
+    skip: range = range(0),
+    watch: Callable[[list[Entry]], None] = lambda _: None,
+) -> list[Entry]:
+    """Play the messages of a journal; returns the entries that follow from them and are not among them.
 
-    `folder` holds the policy files; of the episodes in `skip` only the sums are taken.
+    `folder` holds the policy files; of the episodes in `skip` only the sums are taken; `watch` is given all entries.
     """
-    station.playing, balance = True, _Balance()
-    balance.made(station.out.take().entries)  # a fixed policy is taken before anything is heard
+    balance, skipping = _Balance(), False
+
+    def keep() -> None:
+        made = station.out.take().entries
+        watch(made)
+        balance.made(made)
+
+    keep()  # a fixed policy is taken before anything is heard
+    station.playing = True
     try:
         for raw in journal:
-            balance.written(raw.topic)
-            if raw.schema in _TOLD:
-                _take(station, decode(raw), folder, now, skip)
-                balance.made(station.out.take().entries)
+            message: Any = decode(raw) if raw.schema in _TOLD else None
+            skipping = message.episode in skip if raw.schema == EPISODE else skipping
+            if not skipping or raw.schema == POLICY:
+                balance.written(raw.topic)
+            if message is not None:
+                _take(_SUMS if skipping else _TAKERS, station, message, folder, now)
+                keep()
         station.settle()
-        balance.made(station.out.take().entries)
+        keep()
     finally:
         station.playing = False
     return balance.missing()
 
 
-def _take(station: Station, message: Any, folder: Path, now: float, skip: range) -> None:
-    name = message.DESCRIPTOR.full_name
-    takers = _TAKERS if getattr(message, "episode", 0) not in skip else _SUMS
+def _take(takers: dict[str, Taker], station: Station, message: Any, folder: Path, now: float) -> None:
+    taker = takers.get(message.DESCRIPTOR.full_name)
     try:
-        if name in takers:
-            takers[name](station, message, folder, now)
+        if taker is not None:
+            taker(station, message, folder, now)
     except RefusedError as refused:
         raise RecordError(f"the journal contradicts itself, so do not go on with it: {refused}") from None
 
@@ -144,12 +161,6 @@ def _sum_sync(station: Station, message: Any, _folder: Path, _now: float) -> Non
     station.version = message.version
 
 
-_SUMS: dict[str, Taker] = {
-    "overfly.Episode": _sum_episode,
-    "overfly.FlightRecord": _sum_record,
-    "overfly.Sync": _sum_sync,
-}
-
 # Episodes that are flown again.
 
 
@@ -164,8 +175,9 @@ def _next_of(station: Station, message: Any, now: float) -> Member:
     if message.uav >= len(team) or message.sequence != team[message.uav].sequence:
         text = f"the journal has record {message.sequence} of UAV {message.uav} out of turn: do not go on with it"
         raise RecordError(text)
-    team[message.uav].live(message.life, now)
-    return team[message.uav]
+    member: Member = team[message.uav]
+    member.live(message.life, now)
+    return member
 
 
 def _episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
@@ -211,10 +223,16 @@ def _metrics(station: Station, message: Any, _folder: Path, _now: float) -> None
 
 
 _TAKERS: dict[str, Taker] = {
-    "overfly.Episode": _episode,
+    EPISODE: _episode,
+    POLICY: _policy,
     "overfly.FlightRecord": _record,
     "overfly.Lost": _lost,
-    "overfly.Policy": _policy,
     "overfly.TeamMetrics": _metrics,
+}
+_SUMS: dict[str, Taker] = {
+    EPISODE: _sum_episode,
+    POLICY: _policy,
+    "overfly.FlightRecord": _sum_record,
+    "overfly.Sync": _sum_sync,
 }
 _TOLD = _TAKERS.keys() | _SUMS.keys()

@@ -23,11 +23,19 @@ def beacon(station: Station, sender: str, message: m.Beacon, _now: float) -> Non
 
 
 def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
-    """A UAV is slow, not lost."""
-    if 0 <= message.uav < len(station.roster) and sender == uav_name(message.uav):
-        member = station.roster[message.uav]
-        if message.life == member.life:
-            member.heard, member.named = now, False
+    """A UAV is slow, not lost. Should it have flown on from what is not known here, it must say it again.
+
+    It may wait for a peer that waits for an exchange that a TMC that was started again cannot hold without it.
+    """
+    if not 0 <= message.uav < len(station.roster) or sender != uav_name(message.uav):
+        return
+    member = station.roster[message.uav]
+    if message.life == member.life:
+        member.heard, member.named = now, False
+    elif member.life < 0 or message.life in member.past:
+        return  # lost, or another process flies it now
+    if message.life != member.life or message.sequence > member.sequence + station.early.count(message.uav):
+        station.reject(sender, "state", f"{sender} has flown on from what is not known here: say hello")
 
 
 def status_request(station: Station, sender: str, _request: m.StatusRequest, _now: float) -> None:

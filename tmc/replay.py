@@ -27,6 +27,7 @@ class Sample:
 
     row: Ints
     uav: Ints
+    index: Ints
     observation: Floats
     action: NDArray[np.uint8]
     reward: Floats
@@ -135,10 +136,12 @@ class Replay:
         held = min(self.starts_in, self._starts_kept)
         place = np.arange(self.starts_in - held, self.starts_in)
         start, end = self.starts[place], self.ends[place]
-        row = np.arange(start[0] if held else self.rows_in, self.rows_in)
+        first = int(start[0]) if held else self.rows_in
+        row = np.arange(first, self.rows_in)
         base = self.base[row]
-        frame = np.arange(base.min() if held else self.frames_in, self.frames_in)
-        parts = [start - row[:1], end - row[:1], base - frame[:1], self.frames[frame], self.frame_tick[frame]]
+        oldest = int(base.min()) if held else self.frames_in
+        frame = np.arange(oldest, self.frames_in)
+        parts = [start - first, end - first, base - oldest, self.frames[frame], self.frame_tick[frame]]
         parts += [ring[row] for ring in (self.cells, self.actions, self.rewards, self.tick, self.episode)]
         return hashlib.blake2b(b"".join(p.tobytes() for p in parts), digest_size=16).hexdigest()
 
@@ -164,8 +167,9 @@ class Replay:
             r = self.rewards[np.minimum(start + k, end)][np.arange(B), uav]
             reward += np.where(live, discount * r, 0.0)
             discount = np.where(live, discount * self.gamma, discount)
+        index = start * self.world.config.team.size + uav
         return Sample(
-            start, uav, obs[:B], action.astype(np.uint8), reward.astype(np.float32),
+            start, uav, index, obs[:B], action.astype(np.uint8), reward.astype(np.float32),
             obs[B:], discount.astype(np.float32), allowed[B:],
         )  # fmt: skip
 
@@ -199,16 +203,22 @@ class Replay:
 
     def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
         """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers."""
-        tick = self.tick[row].astype(np.int64)
-        index, R = np.append(self.world.law.index, -1), last_visit.shape[1]
-        padded = np.concatenate([last_visit, np.zeros((row.size, 1), np.uint16)], axis=1)
-        for k in range(1, int((tick - since).max(initial=0)) + 1):
-            live = np.flatnonzero(since + k <= tick)
-            t = (since + k)[live]
-            team = self._team(row[live] - (tick[live] - t))
-            cells = team[np.arange(live.size), uav[live]]
-            known = self.observer.sensed(cells, team, uav[live])
-            known[np.arange(live.size), uav[live]] = True
-            where = np.where(known, index[team], -1)
-            padded[live[:, None], np.where(where < 0, R, where)] = t[:, None]
+        tick, R = self.tick[row].astype(np.int64), last_visit.shape[1]
+        batch, back = _ages(tick - since)
+        team, own = self._team(row[batch] - back), uav[batch]
+        cells = team[np.arange(batch.size), own]
+        known = self.observer.sensed(cells, team, own)
+        known[np.arange(batch.size), own] = True
+        index = np.append(self.world.law.index, -1)[team]
+        where = np.where(known & (index >= 0), index, R)  # column R: what was not sensed, or is not monitored
+        padded = np.empty((row.size, R + 1), np.uint16)
+        padded[:, :R] = last_visit
+        np.maximum.at(padded.ravel(), batch[:, None] * (R + 1) + where, (tick[batch] - back)[:, None].astype(np.uint16))
         return padded[:, :R]
+
+
+def _ages(ticks: Ints) -> tuple[Ints, Ints]:
+    """For each row b, the ages ticks[b] - 1, ..., 1, 0: pairs (b, age), flat. Negative counts have none."""
+    count = np.maximum(ticks, 0)
+    batch = np.repeat(np.arange(ticks.size), count)
+    return batch, np.repeat(np.cumsum(count), count) - 1 - np.arange(batch.size)

@@ -39,7 +39,8 @@ class Outbox:
 class Member:
     """A UAV on the roster: its process's life, the lives before it, when it was last heard of, its last answer.
 
-    `sequence`: of its next record; `durable`: its records below this number are in the journal for good.
+    `sequence`: of its next record; `durable`: its records below this number are in the journal for good; `policy`: the
+    version that it was told to fly. Its next process flies that too: peers may have seen what the last one flew.
     """
 
     life: int = -1
@@ -47,6 +48,7 @@ class Member:
     heard: float = 0.0
     sequence: int = 0
     durable: int = 0
+    policy: int = 0
     answer: m.Map | None = None
     named: bool = False
 

@@ -11,7 +11,7 @@ from typing import Any
 import zmq
 
 from tmc.journal import Journal
-from tmc.roster import LEARNER
+from tmc.roster import LEARNER, uav_name
 from tmc.station import Station
 from tmc.wire import sockets
 from tmc.wire.codec import CodecError, decode
@@ -24,6 +24,8 @@ REST = 0.01
 the processor has the code at hand."""
 FAREWELL = 60.0
 """Seconds that the TMC waits for the last client to leave once the mission is over."""
+REUNION = 3.0
+"""Seconds that a TMC that was started again waits to hear of clients that do not know yet that the mission is over."""
 
 
 class Service:
@@ -36,6 +38,9 @@ class Service:
         self.feed = sockets.router(self.context, sockets.feed_endpoint(endpoint))
         self._where: dict[str, tuple[zmq.Socket[Any], bytes]] = {}
         self._here: set[str] = set()
+        self._expected = set[str]()
+        if journal.found:
+            self._expected = {*map(uav_name, range(len(station.roster))), *([LEARNER] if station.learning else [])}
         self._over: float | None = None
         self._taken: Counter[str] = Counter()
         self._unsettled: float | None = None
@@ -68,18 +73,23 @@ class Service:
     def _settle(self) -> None:
         """The book-keeping that nobody waits for, and a group commit where one is due; only then are records
         acknowledged, with the answers to later ones."""
-        station, since = self.station, self._unsettled
-        if since is not None and (station.settle_now or time.monotonic() - since >= REST):
+        station, since, due = self.station, self._unsettled, self._commit_due()
+        if since is not None and (due or station.settle_now or time.monotonic() - since >= REST):
             self._unsettled = None
             station.settle()
             self._send()
             if station.learning:
                 self.journal.keep_policies(station.policies.held())
             self.journal.take(station.out.take())
-        if self.journal.due == 0.0 or (self.journal.due is not None and station.phase == "done"):
+            due = self._commit_due()
+        if due:  # and whatever was accepted is in the journal: a commit acknowledges all of it
             self.journal.commit()
             station.committed()
             self._send()
+
+    def _commit_due(self) -> bool:
+        due = self.journal.due
+        return due == 0.0 or (due is not None and self.station.phase == "done")
 
     def _drain(self, sock: zmq.Socket[Any]) -> None:
         for _ in range(BURST):
@@ -102,6 +112,7 @@ class Service:
             self.station.reject(sender, error.code, str(error))
             return
         self._here.add(sender)
+        self._expected.discard(sender)
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
@@ -123,8 +134,8 @@ class Service:
             return False
         now = time.monotonic()
         self._over = self._over or now
-        members = [name for name in self._here if name == LEARNER or name.startswith("uav-")]
-        return not members or now - self._over > FAREWELL
+        members = any(name == LEARNER or name.startswith("uav-") for name in self._here)
+        return now - self._over >= max(FAREWELL * members, REUNION * bool(self._expected))
 
     def _say_goodbye(self, reason: str) -> None:
         for sock, identity in self._where.values():

@@ -138,6 +138,8 @@ class Station:
         if record.sequence < following:  # a repeat: it is known, and perhaps answered
             if member.answer is not None and member.answer.sequence == record.sequence:
                 self.send(sender, member.answer)
+            elif flight is not None and record.episode < flight.episode:  # it has not heard that this one began
+                self._resume(record.uav)
         elif flight is None or record.episode != flight.episode or record.sequence > following:
             self.reject(sender, "state", f"record {record.sequence} of {sender} is not the next one")
         else:
@@ -176,7 +178,8 @@ class Station:
         self.out.entries += entries.exchange(flight, exchange, self.policies.newest)
         for i in exchange.uavs:
             member = self.roster[i]
-            answer = flight.answer(exchange, self.policies.newest, member.sequence - 1, member.durable)
+            member.policy = self.policies.newest
+            answer = flight.answer(exchange, member.policy, member.sequence - 1, member.durable)
             self._held.append((uav_name(i), answer))
 
     def _journal_truth(self, flight: Flight, truth: Truth) -> None:
@@ -205,14 +208,14 @@ class Station:
         for i in away:
             self.lose(flight, i)
         for i, member in enumerate(self.roster):
-            member.answer = None
+            member.answer, member.policy = None, self.policies.newest
             self._held.append((uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence)))
         self._release()
 
     def _resume(self, i: int) -> None:
         flight, member = self.flight, self.roster[i]
         assert flight is not None
-        self.send(uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence))
+        self.send(uav_name(i), flight.begin(i, member.policy, member.sequence))
         if member.answer is not None and member.answer.tick == flight.reported[i]:
             self.send(uav_name(i), member.answer)
 
@@ -290,9 +293,7 @@ class Station:
 
     def take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
         """A newer policy is here, or, when a journal is played, was: `model` is empty where the file is gone."""
-        answers = (member.answer for member in self.roster)
-        named = [a.policy for a in (*answers, *(x for _, x in self._held)) if isinstance(a, m.Map | m.Begin)]
-        self.policies.take(version, model, named)
+        self.policies.take(version, model, (member.policy for member in self.roster))
         self.loss = loss
         self.out.entries.append(entries.policy(version, updates, loss, model, last=self._ended))
 

@@ -42,6 +42,8 @@ def resume(args: argparse.Namespace) -> int:
     """Go on with a run from its journal and its checkpoint, whatever was killed."""
     if args.preset or args.out or args.lockstep or settings.chosen(args):
         raise ConfigError("--resume goes on with the run's own settings, as processes: give it nothing but --json")
+    if mission.finished(args.resume):
+        return report(args.resume, as_json=args.json)
     world, policy = mission.interrupted(args.resume)
     code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)
     return code or report(args.resume, as_json=args.json)

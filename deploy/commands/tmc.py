@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from deploy import mission, settings, who
+from deploy.progress import Progress
 from tmc.__main__ import serve
-from tmc.kernel.config import ConfigError, build, flat
+from tmc.kernel.config import Config, ConfigError, build, flat
+from tmc.record.errors import RecordError
+from tmc.record.seal import seal_log
+from tmc.wire.process import DONE
 from tmc.wire.sockets import check_free
 
 
@@ -50,7 +55,7 @@ def main(args: argparse.Namespace) -> int:
         path.parent.mkdir()
         path.write_bytes(policy)
     print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
-    return serve(config, args.bind, out, policy=path, tracks="")
+    return _sealed(serve(config, args.bind, out, policy=path, tracks=""), config, out)
 
 
 def resume(args: argparse.Namespace) -> int:
@@ -60,4 +65,16 @@ def resume(args: argparse.Namespace) -> int:
     world, policy = mission.interrupted(args.resume)
     path = mission.flown_policy(args.resume) if policy is not None else None
     print(f"overfly: the TMC is at {args.bind} again, with the journal in {args.resume}", flush=True)
-    return serve(world.config, args.bind, args.resume, policy=path, tracks="", resume=True)
+    code = serve(world.config, args.bind, args.resume, policy=path, tracks="", resume=True)
+    return _sealed(code, world.config, args.resume)
+
+
+def _sealed(code: int, config: Config, out: Path) -> int:
+    """The exit code of a TMC, whose journal is rewritten for keeping when its mission is over."""
+    if code == DONE:
+        try:
+            sealed = seal_log(out / "tmc.mcap", Progress(config, 1, 0.0).work)
+            print(f"overfly: the log is sealed: {sealed.before:,} bytes before, {sealed.after:,} after")
+        except RecordError as error:
+            print(f"overfly: the log stays as it was written: {error}", file=sys.stderr)
+    return code

@@ -1,4 +1,4 @@
-"""`overfly verify`: that processes fly what one process flies, and that they do so without waiting for each other."""
+"""`overfly verify`: that processes fly what one process flies, wait only where they must, and survive being killed."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from deploy import asynchrony, exactness, settings, who
+from deploy.commands import verify_chaos
 from deploy.mission import check, new_folder
 from deploy.progress import PLAIN_EVERY, clock
 from tmc.kernel.config import Config, ConfigError
@@ -41,6 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     asynchronous.add_argument("--actors", type=int, default=3, metavar="N", help="default: %(default)s")
     asynchronous.add_argument("--hold", type=float, default=0.1, metavar="S", help="seconds a tick (default: 0.1)")
     _add_common(asynchronous)
+    about = verify_chaos.ABOUT
+    verify_chaos.add_options(kinds.add_parser("chaos", help=about, description=about))
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +56,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Verify; exit code 1 when something is not as it should be."""
     try:
-        return _exactness(args) if args.kind == "exactness" else _asynchrony(args)
+        return MAINS[args.kind](args)
     except exactness.Stopped as stopped:
         print(f"overfly: {stopped}", file=sys.stderr)
         return process.FAILED
@@ -186,3 +189,16 @@ def _asynchrony(args: argparse.Namespace) -> int:
             print(json.dumps(asdict(result)) if args.json else result.row(), flush=True)
             good &= result.good
     return process.DONE if good else process.FAILED
+
+
+# Chaos.
+
+
+def _chaos(args: argparse.Namespace) -> int:
+    line = Line()
+    return verify_chaos.main(args, line.write, line.clear)
+
+
+MAINS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "exactness": _exactness, "asynchrony": _asynchrony, "chaos": _chaos,
+}  # fmt: skip

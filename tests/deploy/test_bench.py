@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -31,6 +32,24 @@ def test_rollout_prints_a_line_of_json_a_figure(capsys: pytest.CaptureFixture[st
         assert {"bench", "case", "value", "unit", "reference", "ratio", "platform", "cores", "load", "numpy"} <= set(
             row
         )
+
+
+def test_journal_prints_a_line_of_json_a_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tiny = ["--actors", "2", "--ticks", "100", "--repeats", "1", "--seconds", "0.3", "--dir", str(tmp_path)]
+    assert cli.main(["bench", "journal", *tiny, "--json"]) == 0
+    rows = {row["case"]: row for row in map(json.loads, capsys.readouterr().out.splitlines())}
+    for case in ("none", "process", "power"):
+        assert rows[case]["value"] > 0 and rows[case]["unit"] == "records/s"
+        share = next(row for name, row in rows.items() if name.startswith(f"{case} at "))
+        assert 0 < share["value"] < 2
+    for case in ("process commit", "power commit", "fsync"):
+        assert 0 < rows[case]["value"] < 10_000
+    for case in ("all topics of all files, sealed", "flight records alone, sealed"):
+        assert 0 < rows[case]["value"] < rows[case]["reference"]
+    assert rows["log check of 200 UAV steps"]["value"] > 0
+    assert list(tmp_path.iterdir()) == []
+    assert cli.main(["bench", "journal", "--dir", str(tmp_path / "gone")]) == 2
+    assert "is no folder: choose one" in capsys.readouterr().err
 
 
 def test_memory_is_what_the_system_says() -> None:

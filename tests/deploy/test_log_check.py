@@ -40,8 +40,8 @@ def test_check_prints_a_line_an_invariant(run: Path, capsys: pytest.CaptureFixtu
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
     assert lines[0].split() == ["invariant", "what", "is", "compared", "facts"]
-    assert len(lines) == 24 and all(re.search(r" [\d,]+  (ok|-)$", line) for line in lines[1:22])
-    assert re.fullmatch(rf"{run}/tmc\.mcap: 1 episode, [\d,]+ facts, all invariants hold in \d+\.\d s", lines[23])
+    assert len(lines) == 25 and all(re.search(r" [\d,]+  (ok|-)$", line) for line in lines[1:23])
+    assert re.fullmatch(rf"{run}/tmc\.mcap: 1 episode, [\d,]+ facts, all invariants hold in \d+\.\d s", lines[24])
     assert printed.err == ""
 
 

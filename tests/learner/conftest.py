@@ -93,6 +93,7 @@ def minibatch_of() -> Callable[..., Minibatch]:
             "next_observation": rng.random(images).astype("<f4"),
             "discount": np.full(b, config.dqn.gamma**config.dqn.n_step, "<f4"),
             "allowed": allowed,
+            "index": np.arange(b, dtype="<i8") + 2**20 * number,
         }
         return Minibatch(**{**values, **fields})
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from actors.airspace import Waiting
-from actors.pilot import Phase, Pilot
+from actors.pilot import LostRecordsError, Phase, Pilot
 from actors.planners import PlannerDecider, Sight
 from actors.radio import RadioTracks
 from actors.tracks import TableTracks, TrackTable
@@ -187,7 +187,7 @@ class Mission:
         elif isinstance(message, m.Lost):
             pilot.on_lost(message)
         elif isinstance(message, m.Welcome):
-            self.up[i].extend(pilot.missed(message.sequence))
+            self._say_again(i, message.sequence)
         elif isinstance(message, m.End):
             self.home.add(i)
         elif isinstance(message, m.Beacon):
@@ -201,6 +201,14 @@ class Mission:
             pilot.note()
         if answer is not None:
             self.up[i].append(answer)
+
+    def _say_again(self, i: int, sequence: int) -> None:
+        """What the TMC has not; a process that took over what TMC and process lost together starts anew."""
+        try:
+            self.up[i].extend(self.pilots[i].missed(sequence))
+        except LostRecordsError:
+            assert self.restarts and self.lives[i] > 1, "acknowledged records are lost"
+            self.lose(i, on_the_air=False)
 
     def silence(self) -> None:
         """Nothing moves: every UAV repeats itself, as its service does after a second."""

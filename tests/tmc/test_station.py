@@ -321,7 +321,7 @@ def test_a_silent_uav_is_named_once(flying: Station) -> None:
     flying.tick(1.1 + patience)
     ((level, text),) = flying.out.take().notes
     assert level == "WARNING" and "uav-001" in text and "tick 0" in text and "30 s" in text
-    flying.handle("uav-000", m.Alive(0, 1, 0, 1), 34.0)
+    flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 34.0)
     flying.tick(50.0)
     assert flying.out.take().notes == []
     flying.handle("uav-000", first_record(flying, 0), 51.0)  # as its service does while it waits
@@ -340,7 +340,7 @@ def test_a_uav_that_came_back_can_be_named_again(flying: Station) -> None:
     flying.tick(40.0)
     assert len(flying.out.take().notes) == 2
     flying.handle("uav-001", m.Hello("uav", 1, 2), 41.0)
-    flying.handle("uav-000", m.Alive(0, 1, 0, 1), 60.0)
+    flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 60.0)
     flying.out.take()
     flying.tick(62.0)
     assert flying.out.take().notes == []

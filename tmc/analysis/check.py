@@ -10,6 +10,7 @@ from tmc.analysis import flightlaws, maplaws, rewardlaws
 from tmc.analysis.evidence import Evidence, Gathering
 from tmc.analysis.reckoning import Truth, truth
 from tmc.analysis.setting import world_of
+from tmc.analysis.statelaw import STATE, states
 from tmc.analysis.verdict import Found, Violation
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
@@ -107,7 +108,7 @@ def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) ->
     world, notes = world_of(folder, path)
     result = Result(path, [Row(FILE, "CRCs and numbers of messages to the end of the file")])
     rows = [Row(name, compared) for name, compared, _ in INVARIANTS]
-    result.rows += rows
+    result.rows += [*rows, state := Row(*STATE)]
     log = Log(path)
     for e in Gathering(world).episodes(_sound(log, result.rows[0])):
         reckoned = truth(e)
@@ -116,6 +117,7 @@ def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) ->
         result.episodes += 1
         result.unfinished += not e.ended
         show(f"checked episode {e.number}", e.number / world.config.training.episodes)
+    state.add(states(world, log, show))
     _judge_file(log, result)
     result.note += "".join(f"; {note}" for note in notes)
     if not result.episodes:

@@ -36,6 +36,7 @@ class Observer:
         self._terrain = np.append(terrain, -1.0).astype(np.float32)[self._window]
         place = np.append(np.where(world.law.index < 0, R, world.law.index), R)
         self._place = place[self._window].astype(np.int64)
+        self._monitored = world.law.cells.astype(np.int64)
         targets = np.where(grid.targets == OFF_GRID, 0, grid.targets)
         self.free = (grid.targets != OFF_GRID) & ~world.map.blocked[targets]
         """Shape (K, 9): moves that neither the grid's edge nor an obstacle blocks."""
@@ -83,19 +84,31 @@ class Observer:
 
     def observe_batch(self, cells: Ints, team: Ints, sensed: NDArray[np.bool_], u: NDArray[np.float64]) -> Floats:
         """Observations of a batch: (B,), (B, N), (B, N), (B, R) -> (B, C, H, W), the same bits as `observe`."""
-        B, K = cells.size, self.grid.size
-        rows = np.zeros(B, np.int64) if self._whole else cells
-        out = np.empty((B, 3, self._window.shape[1]), np.float32)
-        plane = np.zeros((B, K + 2), np.float32)  # column K: off the grid; K + 1: where unseen peers go
-        batch = np.arange(B)
-        plane[batch[:, None], np.where(sensed, team, K + 1)] = PEER
-        plane[batch, cells] = EGO
-        out[:, 0] = plane[:, :K] if self._whole else np.take_along_axis(plane, self._window[cells], 1)
-        out[:, 1] = self._terrain[rows]
-        padded = np.zeros((B, u.shape[1] + 1), np.float32)
-        padded[:, :-1] = u
-        out[:, 2] = np.take_along_axis(padded, self._place[rows], 1)
+        B = cells.size
+        out = np.zeros((B, 3, self._window.shape[1]), np.float32)
+        batch, peer = np.nonzero(sensed)
+        self._mark_batch(out, batch, cells[batch], team[batch, peer], PEER)
+        self._mark_batch(out, np.arange(B), cells, cells, EGO)
+        if self._whole:  # only the monitored cells are written: a gather of all of them takes three times as long
+            out[:, 1] = self._terrain[0]
+            out[:, 2][:, self._monitored] = u
+        else:
+            padded = np.zeros((B, u.shape[1] + 1), np.float32)
+            padded[:, :-1] = u
+            out[:, 1] = self._terrain[cells]
+            out[:, 2] = padded.ravel().take(self._place[cells] + np.arange(0, padded.size, padded.shape[1])[:, None])
         return out.reshape(B, *self.shape)
+
+    def _mark_batch(self, out: Floats, batch: Ints, cells: Ints, where: Ints, value: float) -> None:
+        """As `_mark`, for images `batch` of UAVs on `cells`; shapes (n,)."""
+        if self._whole:
+            out[batch, 0, where] = value
+            return
+        side = self.shape[1]
+        y = self._rows[where] - self._rows[cells] + side // 2
+        x = self._cols[where] - self._cols[cells] + side // 2
+        seen = (y >= 0) & (y < side) & (x >= 0) & (x < side)
+        out[batch[seen], 0, (y * side + x)[seen]] = value
 
     def allowed_batch(self, cells: Ints, team: Ints, sensed: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Shape (B, 9): 1 for the actions that `allowed` lists."""

@@ -41,6 +41,12 @@ class Survey:
     digests: tuple[bytes, bytes]
 
 
+def seal_log(path: Path, show: Show = unseen) -> Sealed:
+    """Seal one log, as `seal_run` does."""
+    with closing(held(path)):
+        return _seal(_survey(path, show), show)
+
+
 def seal_run(folder: Path, show: Show = unseen) -> list[Sealed]:
     """Seal all logs of a run. RecordError, and nothing is changed, when one is still written or is damaged."""
     paths = list(run_files(folder).values())

@@ -90,6 +90,7 @@ class LogWriter:
             if old is not None:
                 name.replace(self.active)
                 self.path.unlink(missing_ok=True)
+                disk.sync_folder(self.path.parent)  # the new file goes by its name even after a power cut
             self._old.close()
 
     def write(self, topic: str, message: Any, publish_time: int | None = None) -> int:

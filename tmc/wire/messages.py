@@ -120,12 +120,14 @@ class Map(Message):
 
 @dataclass(frozen=True)
 class Alive(Message):
-    """UAV `uav` is under way at `tick`; it waits for the position of UAV `peer`, or for none (-1)."""
+    """UAV `uav` is under way at `tick`, record `sequence` will be its next; it waits for the position of UAV `peer`, or
+    for none (-1)."""
 
     uav: int = f.integer(0, 65_535)
     life: int = f.integer(0, 2**63 - 1)
     tick: int = f.integer(0, 65_535)
     peer: int = f.integer(-1, 65_535)
+    sequence: int = f.integer(0, 2**62)
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,7 @@ class Minibatch(Message):
 
     `observation`, `next_observation`: (b, C, H, W) float32. `reward`: the n-step sum, unscaled. `discount`: gamma^n.
     `allowed`: (b, 9), 0 for the actions that a UAV in o_{t+n} would not choose. `episodes`: finished so far.
+    `index`: a number of each transition, which no other has before the TMC's next `Welcome`.
     """
 
     request: int = f.integer(0, 2**62)
@@ -176,6 +179,7 @@ class Minibatch(Message):
     next_observation: Array = f.tensor("<f4", 4)
     discount: Array = f.tensor("<f4", 1)
     allowed: Array = f.tensor("u1", 2)
+    index: Array = f.tensor("<i8", 1)
 
 
 @dataclass(frozen=True)

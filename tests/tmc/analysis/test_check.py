@@ -420,7 +420,7 @@ def test_a_broken_invariant_is_caught(
     found = broken(check(altered(fly(**values), tmp_path / "altered", change)))
     assert name in found
     if only:
-        assert set(found) == {name}, found
+        assert set(found) - {"state"} == {name}, found  # a journal that is not true may well not be played
 
 
 def test_every_invariant_is_broken_by_some_journal() -> None:
@@ -433,7 +433,7 @@ def test_the_first_violation_is_named(fly: Fly, tmp_path: Path) -> None:
     assert violation.startswith("episode 1, tick 15, UAV 3: it reckons ")
     row = next(line for line in check(folder).table() if line.startswith("own rewards"))
     assert "VIOLATED: episode 1, tick 15, UAV 3" in row
-    assert "1 of 21 invariants are violated" in check(folder).summary()
+    assert "1 of 22 invariants are violated" in check(folder).summary()
 
 
 @pytest.mark.parametrize(

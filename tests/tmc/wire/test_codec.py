@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tracemalloc
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +20,7 @@ QUICK = settings(max_examples=60, deadline=None)
 Same = Callable[[Message, Message], bool]
 BATCH = Minibatch(
     1, 0, 0, np.zeros((2, 3, 4, 5), "<f4"), np.zeros(2, "u1"), np.zeros(2, "<f4"), np.zeros((2, 3, 4, 5), "<f4"),
-    np.zeros(2, "<f4"), np.ones((2, 9), "u1"),
+    np.zeros(2, "<f4"), np.ones((2, 9), "u1"), np.arange(2),
 )  # fmt: skip
 ANYTHING = st.recursive(
     st.none()
@@ -336,7 +337,7 @@ def test_large_arrays_are_neither_copied_on_the_way_out_nor_in() -> None:
 
 def test_arrays_that_lie_otherwise_in_memory_arrive_in_order() -> None:
     images = np.arange(120, dtype="<f4").reshape(5, 4, 3, 2).T
-    batch = Minibatch(1, 0, 0, images, BATCH.action, BATCH.reward, images, BATCH.discount, BATCH.allowed)
+    batch = dataclasses.replace(BATCH, observation=images, next_observation=images)
     decoded = decode(as_bytes(batch))
     assert isinstance(decoded, Minibatch)
     assert (decoded.observation == images).all()

@@ -43,14 +43,14 @@ EXAMPLES: tuple[Message, ...] = (
         numbers("<f4", 1.5, -20), numbers("<u2", 2), numbers("<u2", 9),
     ),
     m.Map(1, 10, 5, 4, 3, 2, numbers("<u2", 0, 10, 3), EMPTY),
-    m.Alive(1, 12345, 40, -1),
+    m.Alive(1, 12345, 40, -1, 7),
     m.Lost(2, 1, 30),
     m.PolicyRequest(4),
     m.Policy(4, b"\x08\x01onnx\x00"),
     m.SampleRequest(9),
     m.Minibatch(
         9, 0, 100, IMAGES, numbers("u1", 1, 8), numbers("<f4", 1, 2), IMAGES[::-1].copy(), numbers("<f4", 0.9, 0.9),
-        np.ones((2, 9), "u1"),
+        np.ones((2, 9), "u1"), numbers("<i8", 0, 2**40),
     ),
     m.PolicyPush(5, 100, 0.25, b"onnx"),
     m.Ack(5),
@@ -107,7 +107,7 @@ def test_frames_decode_in_the_process_that_made_them(message: Message, same: Sam
 def test_an_empty_minibatch_decodes_in_the_process_that_made_it(same: Same) -> None:
     """Python cannot cast a view of an empty array with several dimensions."""
     images, none = IMAGES[:0], numbers("<f4")
-    empty = m.Minibatch(9, 0, 100, images, numbers("u1"), none, images, none, np.ones((0, 9), "u1"))
+    empty = m.Minibatch(9, 0, 100, images, numbers("u1"), none, images, none, np.ones((0, 9), "u1"), np.zeros(0, "<i8"))
     assert same(decode([bytes(frame) for frame in encode(empty)]), empty)
     assert same(decode(encode(empty)), empty)
 

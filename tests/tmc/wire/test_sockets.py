@@ -99,7 +99,7 @@ def meet(bound: Sock, client: Sock, name: bytes) -> None:
 def batch(b: int) -> Minibatch:
     images = np.random.default_rng(1).random((b, 3, 30, 30)).astype("<f4")
     ones = np.ones(b, "<f4")
-    return Minibatch(1, 2, 3, images, np.ones(b, "u1"), ones, images + 1, ones, np.ones((b, 9), "u1"))
+    return Minibatch(1, 2, 3, images, np.ones(b, "u1"), ones, images + 1, ones, np.ones((b, 9), "u1"), np.arange(b))
 
 
 # Round trips

@@ -1,0 +1,181 @@
+"""`overfly bench learner`: the learner of a running mission against the bare compute loop, in speed and in results.
+
+The mission is the paper's with a memory of 1,500 transitions and a target that follows every 75 updates: each
+transition is drawn 6.4 times before theta- changes and 15 % of them are new then, as with the paper's 100,000 and
+5,000, so as many values of theta- are known when they are needed. Its memory is full after seconds, not half an hour.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+from actors.tracks import create_table
+from deploy import plan, settings
+from deploy.benches.replay import fill
+from deploy.benches.row import Row
+from deploy.mission import check
+from deploy.progress import Observer
+from deploy.supervisor import Supervisor
+from tmc.kernel import observation
+from tmc.kernel.config import Config, ConfigError, flat
+from tmc.kernel.world import World
+from tmc.record.reader import Log, decode, run_files
+from tmc.replay import Replay
+from tmc.wire.messages import Minibatch
+
+SCALED = {"replay.capacity": 1500, "dqn.target_episodes": 0, "dqn.target_updates": 75}
+ENDLESS = 1_000_000
+"""Episodes: the mission is stopped, not finished."""
+POLL = 0.05
+"""Seconds between two looks at the processes."""
+TUNED = "in the learner's environment"
+"""Memory is kept and idle threads sleep, as in the learner; what that alone is worth shows."""
+TICK = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A stretch of a mission: updates a second, the learner's idle share, and ms of the processor an update by role."""
+
+    rate: float
+    idle: float | None
+    cpu: dict[str, float]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the bench."""
+    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each stretch (default: 10)")
+    parser.add_argument("--threads", type=int, default=2, metavar="N", help="of the learner and the loop (default: 2)")
+    parser.add_argument(
+        "--steps", type=int, default=1000, metavar="U", help="updates whose results are compared (default: 1000)"
+    )
+    settings.add_options(parser)
+
+
+def measure(args: argparse.Namespace) -> list[Row]:
+    """Bare loop and mission in turns, then the comparison of results; one row a figure."""
+    if args.repeats < 1 or not args.seconds > 0 or args.steps < 0:
+        raise ConfigError("--repeats must be 1 or more, --seconds more than 0, and --steps 0 or more")
+    values = {**SCALED, "training.episodes": ENDLESS, "training.threads": args.threads, **settings.chosen(args)}
+    world = check(settings.config_for("paper", values))
+    bare: list[float] = []
+    tuned: list[float] = []
+    flown: list[Learned] = []
+    with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:
+        for _ in range(args.repeats):
+            bare.append(bare_loop(world.config, args.seconds, "bare"))
+            flown.append(fly(world, args.seconds, Path(tempfile.mkdtemp(dir=scratch))))
+            tuned.append(bare_loop(world.config, args.seconds, "learner"))
+            _say(f"bare loop {bare[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s")
+    rows = list(_rows(world.config, flown, bare, tuned))
+    return rows + (list(compare(world, args.steps)) if args.steps else [])
+
+
+def _rows(config: Config, flown: list[Learned], bare: list[float], tuned: list[float]) -> Iterator[Row]:
+    case, rates = f"N={config.team.size} threads={config.training.threads}", [f.rate for f in flown]
+    for name, reference in (("bare loop", bare), (f"bare loop {TUNED}", tuned)):
+        ratio = median(a / b for a, b in zip(rates, reference, strict=True))
+        yield Row("learner", f"{case}", median(rates), "updates/s", median(reference), ratio, f"x {name}")
+    idle = [f.idle for f in flown if f.idle is not None]
+    yield Row("learner", f"{case} idle", median(idle) if idle else None, "share of time")
+    for role in flown[0].cpu:
+        yield Row("learner", f"{case} {role}", median(f.cpu[role] for f in flown), "ms of CPU an update")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def bare_loop(config: Config, seconds: float, name: str) -> float:
+    """Updates a second of `learner.bare` in a process of its own, with the environment of process `name`."""
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        file.write(json.dumps(flat(config)))
+        file.flush()
+        command = [sys.executable, "-P", "-m", "learner.bare", "--config", file.name, "--seconds", str(seconds)]
+        env = plan.environment(name, config.training.threads)
+        env |= {"OMP_WAIT_POLICY": "PASSIVE"} if name == "learner" else {}
+        done = subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE, text=True)
+    return float(done.stdout)
+
+
+def fly(world: World, seconds: float, out: Path) -> Learned:
+    """A mission in processes of its own; time is taken once the memory is full and theta- has changed."""
+    config = world.config
+    (out / "config.json").write_text(json.dumps(flat(config)))
+    mission = plan.make(config, out, policy=None)
+    supervisor = Supervisor(mission, out, config.training.threads, _say)
+    observer = Observer(mission.endpoint)
+    try:
+        create_table(mission.tracks, config.team.size, config.training.ticks)
+        supervisor.start()
+        warm = config.replay.capacity // config.team.size + config.dqn.target_updates
+        began, updates = _wait(supervisor, observer, updates=warm)
+        cpu = _cpu(supervisor.pids())
+        ended, more = _wait(supervisor, observer, until=began + seconds)
+        spent = {role: 1e3 * (s - cpu[role]) / (more - updates) for role, s in _cpu(supervisor.pids()).items()}
+    finally:
+        observer.close()
+        supervisor.stop()
+        supervisor.close()
+    return Learned((more - updates) / (ended - began), _idle(out, seconds), spent)
+
+
+def _wait(supervisor: Supervisor, observer: Observer, updates: int = 0, until: float = 0.0) -> tuple[float, int]:
+    """(seconds of the clock, updates) when there have been `updates`, and the clock is past `until`."""
+    while True:
+        supervisor.watch()
+        status, now = observer.ask(), time.monotonic()
+        if status is not None and status.updates >= updates and now >= until:
+            return now, status.updates
+        time.sleep(POLL)
+
+
+def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
+    """Seconds of the processor so far, by role: learner, TMC, and all UAVs together."""
+    spent = dict.fromkeys(("learner", "tmc", "uavs"), 0.0)
+    for name, pid in pids.items():
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        role = "uavs" if name.startswith("uav-") else name
+        spent[role] = spent.get(role, 0.0) + (int(fields[11]) + int(fields[12])) / TICK
+    return spent
+
+
+def _idle(out: Path, seconds: float) -> float | None:
+    """The mean idle share that the learner logged in the last `seconds`."""
+    path = run_files(out).get("learner")
+    told = [(raw.log_time, decode(raw)) for raw in Log(path).raw() if raw.topic == "/learner/metrics"] if path else []
+    shares = [metrics.idle_share for at, metrics in told if at > told[-1][0] - seconds * 1e9]
+    return sum(shares) / len(shares) if shares else None
+
+
+def compare(world: World, steps: int) -> Iterator[Row]:
+    """The weights after so many updates against those of the bare loop, from the same minibatches of random flights."""
+    from learner import bare  # noqa: PLC0415  torch only for those who measure this
+
+    replay = Replay(world, observation.Observer(world))
+    fill(replay)
+    ours, rounding, moved = bare.departures(world.config, _minibatches(replay, steps))
+    case = f"{steps:,} steps"
+    yield Row("learner", f"{case} weights", ours, "largest difference", rounding, ours / rounding, "x rounding alone")
+    yield Row("learner", f"{case} moved", moved, "largest difference", what="from the first weights")
+
+
+def _minibatches(replay: Replay, count: int) -> Iterator[Minibatch]:
+    for number in range(count):
+        if number % 200 == 199:
+            _say(f"{number + 1:,} of {count:,} steps compared")
+        s = replay.sample(number, replay.world.config.dqn.batch)
+        yield Minibatch(
+            number, 0, 0, s.observation, s.action, s.reward, s.next_observation, s.discount, s.allowed, s.index
+        )

@@ -1,0 +1,135 @@
+"""`overfly verify chaos`: what it takes, and the table of what came of it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from deploy import settings, who
+from deploy.chaos import trial
+from deploy.chaos.blows import CUT, POWER, STOP, Blow, blows
+from deploy.chaos.storm import Storm
+from deploy.mission import check, new_folder
+from deploy.progress import clock
+from tmc.kernel.config import Config, ConfigError, build
+from tmc.roster import LEARNER, uav_name
+from tmc.wire import process
+
+ABOUT = "kill, stop and cut off the processes of a mission at random, and look whether anything was lost or doubled"
+MODES = ("train", "fly")
+ROLES = ("tmc", LEARNER, "uav", POWER)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of the trial; those of missions come on top."""
+    parser.add_argument("preset", nargs="?", help="settings to start from (default: quick, or paper with --mode fly)")
+    parser.add_argument("--mode", choices=MODES, default="train", help="a training, or missions of a fixed pilot that "
+                        "must end as they do in lock step (default: train)")  # fmt: skip
+    parser.add_argument("--kills", type=int, default=200, metavar="K", help="kill -9, in all (default: 200)")
+    parser.add_argument("--storm", type=int, default=1, metavar="S", help="seed of the blows (default: 1)")
+    parser.add_argument("--who", default="planner:greedy", help="who flies with --mode fly: policy, run or planner")
+    parser.add_argument("--power", action="store_true", help="half of the kills are power cuts; the journal is synced")
+    parser.add_argument("--ack-early", action="store_true", help="the counter-check: a TMC that acknowledges too early "
+                        "is killed until records are lost; ends with exit code 1")  # fmt: skip
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the run folders and the diary there")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON")
+    settings.add_options(parser)
+
+
+def main(args: argparse.Namespace, say: Callable[[str], None], clear: Callable[[], None]) -> int:
+    """Run the trial; exit code 1 when anything is not as it should be."""
+    config, policy = _config(args)
+    storm_blows = _blows(args, config)
+    place = Path(tempfile.mkdtemp(prefix="overfly-chaos-")) if args.keep is None else new_folder(args.keep, "chaos")
+    storm = Storm(storm_blows, say, place / "diary.txt", until_loss=args.ack_early)
+    start = time.monotonic()
+    try:
+        verdict = trial.run(config, policy, place, storm, trains=args.mode == "train")
+    except KeyboardInterrupt:
+        clear()
+        if args.keep is None:
+            shutil.rmtree(place)
+        raise
+    clear()
+    good = not verdict.faults
+    kept = "" if good and args.keep is None else str(place)
+    if not kept:
+        shutil.rmtree(place)
+    seconds = time.monotonic() - start
+    if args.json:
+        print(json.dumps(as_json(verdict, seconds) | {"folder": kept}), flush=True)
+    else:
+        print("\n".join([*table(verdict), "", *conclusion(verdict, seconds, kept, early=args.ack_early)]), flush=True)
+    return process.DONE if good else process.FAILED
+
+
+def _config(args: argparse.Namespace) -> tuple[Config, bytes | None]:
+    """The settings of the trial and the policy that flies, if one does; raises ConfigError."""
+    if args.kills < 1:
+        raise ConfigError("--kills must be 1 or more")
+    more = {"trial.ack_early": args.ack_early, **({"journal.durability": "power"} if args.power else {})}
+    if args.mode == "train":
+        config = settings.config_for(args.preset or "quick", {**trial.TRAIN, **more, **settings.chosen(args)})
+        return config, None
+    pilot = who.resolve(args.who)
+    base = settings.config_for(args.preset or "paper", {**pilot.values, **who.FIXED, **trial.FLY, **more})
+    return build({**settings.chosen(args), **who.pilot_of(pilot)}, base), pilot.policy
+
+
+def _blows(args: argparse.Namespace, config: Config) -> list[Blow]:
+    world = check(config)
+    team = [uav_name(i) for i in range(world.config.team.size)]
+    names = ["tmc"] if args.ack_early else ["tmc", *([LEARNER] if args.mode == "train" else []), *team]
+    return blows(args.kills, args.storm, names, power=args.power)
+
+
+def table(verdict: trial.Verdict) -> Iterator[str]:
+    """What was done, and what came of it."""
+    storm = verdict.storm
+    yield f"{'killed':<14} {'times':>6} {'came back':>10} {'median':>9} {'worst':>9}"
+    for role in ROLES:
+        if storm.kills[role]:
+            took = storm.recoveries[role]
+            times = f"{median(took):>7.2f} s {max(took):>7.2f} s" if took else f"{'-':>9} {'-':>9}"
+            yield f"{'power cut' if role == POWER else role:<14} {storm.kills[role]:>6} {storm.backs[role]:>10} {times}"
+    rows = [("stopped a while", storm.count(STOP)), ("cut off a while", storm.count(CUT))]
+    rows += [("journal cut, bytes", storm.cut_off)] if storm.kills[POWER] else []
+    rows += [("missions", verdict.missions)]
+    rows += [(name, verdict.sum(name)) for name in ("episodes", "ticks", "updates")]
+    rows += [(f"records {what}", verdict.sum(what)) for what in ("journalled", "acknowledged", "lost")]
+    rows += [("records applied twice", verdict.sum("doubled")), ("facts checked", verdict.facts)]
+    yield ""
+    yield from (f"{name:<22} {value:>12,}" for name, value in rows)
+
+
+def conclusion(verdict: trial.Verdict, seconds: float, kept: str, *, early: bool) -> Iterator[str]:
+    """The verdict in sentences."""
+    kills, lost = sum(verdict.storm.kills.values()), verdict.sum("lost")
+    if early:
+        yield (f"acknowledged too early, {lost:,} records were lost: the trial sees losses when there are some"
+               if lost else "acknowledged too early, and no loss was seen: give it more kills")  # fmt: skip
+    elif not verdict.faults:
+        yield f"{kills} kills in {clock(seconds)}: nothing was lost, nothing doubled, everybody came back"
+    yield from (f"overfly: {fault}" for fault in verdict.faults)
+    if kept:
+        yield f"run folders and diary are in {kept}"
+
+
+def as_json(verdict: trial.Verdict, seconds: float) -> dict[str, Any]:
+    """All of the table."""
+    storm = verdict.storm
+    counts = ("episodes", "ticks", "updates", "journalled", "acknowledged", "lost", "doubled")
+    return {
+        "kills": dict(storm.kills), "back": dict(storm.backs), "stops": storm.count(STOP), "cuts": storm.count(CUT),
+        "recovery": {role: {"median": round(median(took), 3), "worst": round(max(took), 3)}
+                     for role, took in storm.recoveries.items()},
+        "missions": verdict.missions, **{name: verdict.sum(name) for name in counts}, "facts": verdict.facts,
+        "bytes_cut": storm.cut_off, "faults": verdict.faults, "seconds": round(seconds, 1),
+    }  # fmt: skip

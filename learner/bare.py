@@ -1,0 +1,135 @@
+"""The bare compute loop: the update of Algorithm 1 as anybody would write it in torch, and nothing around it.
+
+`overfly bench learner` holds the learner against it, in speed and in results: contiguous tensors, eager mode, torch's
+default Adam, everything computed every time. `python -m learner.bare` runs it on one minibatch that stays in memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from learner import dqn, qnet
+from learner.trainer import Trainer, copy_due
+from tmc.kernel.config import Config, build
+from tmc.kernel.grid import N_ACTIONS
+from tmc.kernel.policy import view_shape
+from tmc.kernel.world import World
+from tmc.wire.messages import Array, Minibatch
+
+WARM = 10
+"""Updates before time is taken."""
+
+
+class Bare:
+    """theta, theta- and Adam, from the initial weights of the settings; theta- follows as the trainer's does."""
+
+    def __init__(self, config: Config, shape: qnet.Shape) -> None:
+        self.config = config
+        self.online = qnet.build(config, shape)
+        self.target = copy.deepcopy(self.online).requires_grad_(False)
+        self.adam = torch.optim.Adam(self.online.parameters(), lr=config.dqn.learning_rate)
+        self.updates = self.copied = 0
+
+    def follow(self, episodes: int) -> None:
+        """theta- = theta, when so many finished episodes or the updates so far make it due."""
+        every = self.config.dqn.target_updates
+        if copy_due(episodes, self.copied, self.config.dqn.target_episodes):
+            self.copied = episodes
+        elif not every or self.updates == 0 or self.updates % every:
+            return
+        self.target.load_state_dict(self.online.state_dict())
+
+    def update(self, batch: Batch) -> None:
+        """One step of Adam on eq. (9)."""
+        d = self.config.dqn
+        with torch.no_grad():
+            choice = self.online(batch.o_next) if d.double else None
+            y = dqn.target(
+                batch.reward * d.reward_scale, batch.discount, self.target(batch.o_next), batch.allowed, choice
+            )
+        loss = dqn.loss(dqn.td_error(self.online(batch.o), batch.action, y), d.loss)
+        self.adam.zero_grad()
+        torch.autograd.backward(loss)
+        self.adam.step()
+        self.updates += 1
+
+
+class Batch:
+    """A minibatch as tensors; `reverse`: its rows from the last to the first."""
+
+    def __init__(self, minibatch: Minibatch, *, reverse: bool = False) -> None:
+        def rows(array: Array) -> torch.Tensor:
+            return torch.tensor(array[::-1].copy() if reverse else array)
+
+        self.o, self.o_next = rows(minibatch.observation), rows(minibatch.next_observation)
+        self.action, self.allowed = rows(minibatch.action).long(), rows(minibatch.allowed)
+        self.reward, self.discount = rows(minibatch.reward), rows(minibatch.discount)
+
+
+def resident(config: Config, shape: qnet.Shape) -> Minibatch:
+    """A minibatch of noise, for timing: what is in it does not change what is computed."""
+    rng, b = np.random.Generator(np.random.Philox(1)), config.dqn.batch
+    o, o_next = (rng.random((b, *shape), np.float32) for _ in range(2))
+    action, reward = rng.integers(0, N_ACTIONS, b).astype("u1"), rng.random(b, np.float32)
+    discount, allowed = np.full(b, config.dqn.gamma, "<f4"), np.ones((b, N_ACTIONS), "u1")
+    return Minibatch(0, 0, 0, o, action, reward, o_next, discount, allowed, np.arange(b))
+
+
+def rate(config: Config, seconds: float) -> float:
+    """Updates a second of the bare loop, on as many threads as the settings say."""
+    torch.set_num_threads(config.training.threads)
+    shape = view_shape(config, World(config).grid)
+    bare, batch = Bare(config, shape), Batch(resident(config, shape))
+    for _ in range(WARM):
+        bare.update(batch)
+    start = time.perf_counter()
+    while time.perf_counter() < start + seconds:
+        bare.update(batch)
+    return (bare.updates - WARM) / (time.perf_counter() - start)
+
+
+def departures(config: Config, minibatches: Iterable[Minibatch]) -> tuple[float, float, float]:
+    """How far the trainer's weights are from the bare loop's after these minibatches, the largest of all weights.
+
+    Then the same of two bare loops, one of which gets the rows of each minibatch in reverse: the same mathematics, and
+    only sums in another order, so float32's rounding and nothing else. Last, how far the weights have moved at all.
+    """
+    grid = World(config).grid
+    shape = view_shape(config, grid)
+    trainer, bare, reverse = Trainer(config, shape, grid), Bare(config, shape), Bare(config, shape)
+    for minibatch in minibatches:
+        trainer.update(minibatch)
+        for loop in (bare, reverse):
+            loop.follow(minibatch.episodes)
+            loop.update(Batch(minibatch, reverse=loop is reverse))
+    others = (trainer.online, reverse.online, qnet.build(config, shape))
+    ours, rounding, moved = (_farthest(net, bare.online) for net in others)
+    return ours, rounding, moved
+
+
+@torch.no_grad()
+def _farthest(a: qnet.QNet, b: qnet.QNet) -> float:
+    return max(float((p - q).abs().max()) for p, q in zip(a.parameters(), b.parameters(), strict=True))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the updates a second."""
+    parser = argparse.ArgumentParser("learner.bare", description=__doc__)
+    parser.add_argument("--config", type=Path, required=True, help="settings as JSON, dotted keys")
+    parser.add_argument("--seconds", type=float, default=5.0)
+    a = parser.parse_args(argv)
+    print(rate(build(json.loads(a.config.read_text())), a.seconds))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,62 @@
+"""`overfly verify chaos` itself, small: nothing is lost, whatever is killed, unless the TMC acknowledges too early."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Overfly = Callable[..., subprocess.CompletedProcess[str]]
+SHORT = ("--actors", "3", "--ticks", "400", "--episodes", "2", "--json")
+LIGHT = ("--actors", "2", "--ticks", "200", "--set", "dqn.batch=8", "--set", "replay.learn_start=16", "--json")
+
+
+def storm(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
+    """The trial's row; nothing but progress may have gone to stderr."""
+    done = overfly("verify", "chaos", *options)
+    assert done.returncode == code, done.stdout + done.stderr
+    assert done.stderr and all(line.startswith("kill ") for line in done.stderr.splitlines())
+    row: dict[str, Any] = json.loads(done.stdout)
+    return row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kills", "options"), [(8, ()), (3, ("--scenario", "1")), (3, ("--set", "comms.phase=staggered"))], ids=str
+)
+def test_missions_that_are_disturbed_fly_what_lock_step_flies(
+    overfly: Overfly, tmp_path: Path, kills: int, options: tuple[str, ...]
+) -> None:
+    row = storm(overfly, "--mode", "fly", "--kills", str(kills), *SHORT, *options)
+    assert row["faults"] == [] and row["folder"] == ""
+    assert sum(row["kills"].values()) == kills and row["back"] == row["kills"]
+    assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
+    assert row["episodes"] == 2 * row["missions"] and row["ticks"] == 400 * row["episodes"]
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_training_that_is_disturbed_goes_on(overfly: Overfly) -> None:
+    row = storm(overfly, "--kills", "5", "--storm", "20", *LIGHT)
+    assert row["faults"] == [] and set(row["kills"]) == {"tmc", "learner", "uav"} and row["back"] == row["kills"]
+    assert row["lost"] == row["doubled"] == 0 and row["updates"] > 0 and row["acknowledged"] > 0
+
+
+@pytest.mark.slow
+def test_power_cuts_take_nothing_that_was_acknowledged(overfly: Overfly) -> None:
+    row = storm(overfly, "--mode", "fly", "--power", "--kills", "5", "--storm", "2", *SHORT)
+    assert row["faults"] == [] and row["kills"]["power"] >= 1 and row["back"] == row["kills"]
+    assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
+
+
+@pytest.mark.slow
+def test_losses_are_seen_when_there_are_some(overfly: Overfly, tmp_path: Path) -> None:
+    """The counter-check. What was kept shows it too: the last commit is older than what was acknowledged."""
+    options = ("--mode", "fly", "--ack-early", "--kills", "12", "--set", "journal.commit=0.2", *SHORT)
+    row = storm(overfly, *options, "--keep", str(tmp_path / "kept"), code=1)
+    assert row["lost"] > 0 and any("were acknowledged and are lost" in fault for fault in row["faults"])
+    assert row["folder"] == str(tmp_path / "kept") and "did not survive" in (tmp_path / "kept/diary.txt").read_text()

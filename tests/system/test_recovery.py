@@ -1,0 +1,162 @@
+"""Real processes killed with SIGKILL, and the run that goes on as if nothing had happened; and what cannot go on."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import main
+from tmc.analysis.check import check
+from tmc.journal import journal_in
+from tmc.kernel.config import Journal
+from tmc.record.facts import digest
+from tmc.record.reader import Log
+from tmc.record.writer import LogWriter
+
+Overfly = Callable[..., subprocess.CompletedProcess[str]]
+Running = Callable[[str], list[int]]
+FLIGHT = ("fly", "planner:greedy", "--actors", "3", "--ticks", "500", "--seed", "7")
+SLOW = ("--set", "trial.stall=0.005", "--set", "trial.stall_share=1.0")
+"""Every UAV stalls a little, so that the mission lasts long enough to be killed in."""
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The digest of the flight when nobody disturbs it."""
+    out = tmp_path_factory.mktemp("calm") / "R"
+    assert main([*FLIGHT, "--lockstep", "--out", str(out)]) == 0
+    return digest(out)
+
+
+def begin(tmp_path: Path, *command: str) -> subprocess.Popen[str]:
+    line = [sys.executable, "-P", "-m", "deploy.cli", *command]
+    return subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+
+
+def wait_for(what: Callable[[], object], run: subprocess.Popen[str], seconds: float = 60) -> None:
+    until = time.monotonic() + seconds
+    while not what():
+        assert run.poll() is None and time.monotonic() < until, "it did not come to it"
+        time.sleep(0.02)
+
+
+def ended(out: Path) -> int:
+    """Episodes that have ended, as the journal has it by now."""
+    journal = journal_in(out)
+    if journal is None:
+        return 0
+    ends = [e.message.episode for e in Log(journal).entries(["/tmc/episode"]) if e.message.phase == "end"]
+    return max(ends, default=0)
+
+
+def records(out: Path) -> int:
+    journal = journal_in(out)
+    return 0 if journal is None else sum(raw.topic.endswith("/record") for raw in Log(journal).raw())
+
+
+def kill_all(run: subprocess.Popen[str], running: Running, out: Path) -> None:
+    """The supervisor first, so that it starts nobody again; then all that it had started, should they still live."""
+    run.kill()
+    for pid in running(str(out)):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    run.communicate(timeout=60)
+    until = time.monotonic() + 10
+    while running(str(out)) and time.monotonic() < until:
+        time.sleep(0.02)
+
+
+def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, calm: str, tmp_path: Path) -> None:
+    out, draw, kills = tmp_path / "R", random.Random(5), 0
+    with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
+        while kills < 5:
+            before = records(out)
+            wait_for(lambda before=before: records(out) > before, run)
+            time.sleep(draw.uniform(0.0, 0.4))
+            found = [pid for pid in running("-m tmc --config") if pid in running(str(out))]
+            assert len(found) == 1 and run.poll() is None
+            os.kill(found[0], signal.SIGKILL)
+            kills += 1
+            wait_for(lambda pid=found[0]: pid not in running(str(out)), run)
+        _, errors = run.communicate(timeout=120)
+    assert run.returncode == 0, errors
+    assert errors.count("tmc was killed by SIGKILL; it is started again") == 5
+    assert digest(out) == calm and check(out).good
+    said = [e.message.message for e in Log(out / "tmc.mcap").entries(["/log"])]
+    assert sum("the TMC was started again and goes on from tick" in text for text in said) == 5
+
+
+def test_a_flight_goes_on_after_everything_was_killed(
+    overfly: Overfly, running: Running, calm: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "R"
+    with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
+        wait_for(lambda: records(out) > 40, run)
+        busy = overfly("run", "--resume", out)
+        assert busy.returncode == 2 and "is being written by another process: end that one first" in busy.stderr
+        kill_all(run, running, out)
+    assert 40 < records(out) < 3 * 51 and not (out / "tmc.mcap").exists()
+    again = overfly("run", "--resume", out)
+    assert again.returncode == 0, again.stderr
+    assert "Uncertainty" in again.stdout
+    assert digest(out) == calm and check(out).good
+    told = json.loads((out / "run.json").read_text())
+    assert set(told["exit_codes"].values()) == {0} and told["sealed"]["after"] > 0
+    # Finished now: nothing is flown again, and the summary is said.
+    size, start = (out / "tmc.mcap").stat(), time.monotonic()
+    done = overfly("run", "--resume", out, "--json")
+    assert done.returncode == 0 and json.loads(done.stdout)
+    assert time.monotonic() - start < 15 and (out / "tmc.mcap").stat() == size
+
+
+def test_training_goes_on_after_everything_was_killed(overfly: Overfly, running: Running, tmp_path: Path) -> None:
+    out = tmp_path / "R"
+    small = ("--actors", "2", "--ticks", "60", "--episodes", "4", "--set", "replay.learn_start=60")
+    small = (*small, "--set", "dqn.batch=16", "--set", "training.checkpoint_every=20", "--set", "replay.slack=20")
+    with begin(tmp_path, "run", "patrol", *small, "--out", str(out)) as run:
+        wait_for(lambda: ended(out) >= 1 and list((out / "checkpoints").glob("*.safetensors")), run)
+        kill_all(run, running, out)
+    before = ended(out)
+    again = overfly("run", "--resume", out)
+    assert again.returncode == 0, again.stderr
+    assert 1 <= before <= ended(out) == 4
+    entries = [e.message for e in Log(out / "tmc.mcap").entries(["/tmc/episode"])]
+    assert [(e.episode, e.phase) for e in entries] == [(n, p) for n in range(1, 5) for p in ("begin", "end")]
+    # 240 ticks; learning starts once 60 transitions are in, which is when some of the first 40 ticks are final.
+    policies = [e.message for e in Log(out / "tmc.mcap").entries(["/learner/policy"])]
+    assert 200 <= policies[-1].updates < 240 and [p.version for p in policies] == sorted(p.version for p in policies)
+    assert check(out).good
+
+
+def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty, strange = tmp_path / "empty", tmp_path / "strange"
+    empty.mkdir()
+    strange.mkdir()
+    LogWriter(strange / "tmc.mcap", "tmc", Journal(), {}).close()
+    for command, sentence in (
+        (("run", "--resume", empty), "holds no journal (tmc.mcap): --resume takes the folder of a run that was begun"),
+        (("tmc", "--resume", empty), "holds no journal (tmc.mcap)"),
+        (("run", "--resume", tmp_path / "gone"), "holds no journal (tmc.mcap)"),
+        (("run", "--resume", strange), "config.json cannot be read"),
+        (
+            ("run", "quick", "--resume", strange),
+            "with the run's own settings, as processes: give it nothing but --json",
+        ),
+        (("run", "--resume", strange, "--ticks", 5), "give it nothing but --json"),
+        (("tmc", "--resume", strange, "--ticks", 5), "give it nothing but --bind"),
+        (("run",), "which preset?"),
+    ):
+        assert main([str(word) for word in command]) == 2
+        said = capsys.readouterr()
+        assert sentence in said.err and len(said.err.splitlines()) == 1 and said.out == ""
+    assert list(empty.iterdir()) == []
