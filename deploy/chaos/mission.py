@@ -209,6 +209,8 @@ class Disturbed(Mission):
                 os.kill(pid, signal.SIGKILL)
         self.supervisor.wait(PATIENCE)
         self.storm.cut_off += cut_tails(self.out, Random(blow.draw))
+        self.storm.snapshots.append(Snapshot.take(self.out))
+        self.storm.check_snapshots()
 
 
 _STRIKES: dict[str, Callable[[Disturbed, Blow], Any]] = {

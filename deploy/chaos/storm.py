@@ -39,7 +39,7 @@ class Storm:
     def __init__(
         self, blows: Iterable[Blow], say: Callable[[str], None], diary: Path, *, until_loss: bool = False
     ) -> None:
-        self._left, self._say, self._diary, self._until_loss = deque(blows), say, diary, until_loss
+        self._left, self.say, self._diary, self._until_loss = deque(blows), say, diary, until_loss
         self.asked = sum(blow.kills for blow in self._left)
         self.done: list[Blow] = []
         self.kills: Counter[str] = Counter()
@@ -125,4 +125,4 @@ class Storm:
         status = self.growth.last
         where = f" · episode {status.episode} tick {status.tick} · {status.updates:,} updates" if status else ""
         left = f" · {clock(spent / killed * (self.asked - killed))} left" if killed else ""
-        self._say(f"kill {killed} of {self.asked}{where}{left}")
+        self.say(f"kill {killed} of {self.asked}{where}{left}")

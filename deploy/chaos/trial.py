@@ -99,7 +99,7 @@ def _judge(verdict: Verdict, out: Path) -> None:
     storm = verdict.storm
     verdict.exact.append(judge(out, storm.lost))
     storm.lost.clear()
-    result = check_log(out)
+    result = check_log(out, lambda what, _share: storm.say(f"{out.name}: {what}"))
     verdict.facts += sum(row.facts for row in result.rows)
     verdict.faults += [f"log check: {row.name}: {row.violation}" for row in result.rows if row.violation is not None]
 
@@ -110,8 +110,9 @@ def _compare(verdict: Verdict, world: World, policy: bytes | None, out: Path) ->
     fly(check(build(CALM, world.config), policy), policy, calm, in_one_process=True)
     if facts.digest(out) != facts.digest(calm):
         verdict.faults.append(f"{out.name} flew other cells than the same mission in lock step")
+    states = _states(out)
     for episode, state in _states(calm).items():
-        if _states(out).get(episode) != state:
+        if states.get(episode) != state:
             verdict.faults.append(
                 f"after episode {episode} of {out.name}, maps or replay memory are not as in lock step"
             )

@@ -74,7 +74,8 @@ def _config(args: argparse.Namespace) -> tuple[Config, bytes | None]:
     """The settings of the trial and the policy that flies, if one does; raises ConfigError."""
     if args.kills < 1:
         raise ConfigError("--kills must be 1 or more")
-    more = {"trial.ack_early": args.ack_early, **({"journal.durability": "power"} if args.power else {})}
+    more: dict[str, Any] = {"trial.ack_early": args.ack_early}
+    more |= {"journal.durability": "power"} if args.power else {}
     if args.mode == "train":
         config = settings.config_for(args.preset or "quick", {**trial.TRAIN, **more, **settings.chosen(args)})
         return config, None

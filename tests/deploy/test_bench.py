@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,6 +51,52 @@ def test_journal_prints_a_line_of_json_a_figure(tmp_path: Path, capsys: pytest.C
     assert list(tmp_path.iterdir()) == []
     assert cli.main(["bench", "journal", "--dir", str(tmp_path / "gone")]) == 2
     assert "is no folder: choose one" in capsys.readouterr().err
+
+
+def rows_of(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    """What a bench prints, by case and what the reference is."""
+    assert cli.main(["bench", *command, "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    return {f"{row['case']} {row['what']}".strip(): row for row in rows}
+
+
+def test_replay_weighs_and_draws(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = rows_of(capsys, "replay", "--minibatches", "3", "--set", "replay.capacity=9000", "--set", "dqn.batch=16")
+    assert 20 < rows["9,000 transitions of what is asked"]["value"] < 100
+    assert 0 < rows["a minibatch of 16 of what is asked"]["value"] < 1000
+    assert rows["inserts of what is asked"]["value"] > 1000
+
+
+def test_actor_holds_a_step_against_its_network(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = rows_of(capsys, "actor", "--repeats", "1", "--ticks", "60", "--actors", "2")
+    step = rows["N=2 a whole step the call of ONNX Runtime / step"]
+    assert 0 < step["ratio"] < 1
+    assert step["ratio"] == pytest.approx(step["reference"] / step["value"], rel=0.01)
+
+
+def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str]) -> None:
+    """A small mission in real processes; every value it needs is kept, and the results are the bare loop's."""
+    small = ["replay.capacity=200", "dqn.target_updates=10", "dqn.batch=16", "network.channels=4,4"]
+    changes = [part for change in small for part in ("--set", change)]
+    turns = ["--repeats", "1", "--seconds", "1", "--threads", "1", "--steps", "40"]
+    rows = rows_of(capsys, "learner", *turns, "--actors", "2", "--ticks", "200", *changes)
+    rate = rows["N=2 threads=1 x bare loop"]
+    assert rate["value"] > 0 and rate["ratio"] == pytest.approx(rate["value"] / rate["reference"])
+    assert 0 <= rows["N=2 threads=1 idle"]["value"] <= 1
+    assert rows["N=2 threads=1 learner"]["value"] > 0
+    assert (
+        rows["40 steps weights x rounding alone"]["value"]
+        < 1e-3
+        < rows["40 steps moved from the first weights"]["value"]
+    )
+
+
+@pytest.mark.parametrize(
+    "mistake", [["learner", "--seconds", "0"], ["replay", "--minibatches", "0"], ["actor", "--repeats", "0"]]
+)
+def test_a_number_that_makes_no_sense_is_one_sentence(mistake: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", *mistake]) == 2
+    assert mistake[1] in capsys.readouterr().err
 
 
 def test_memory_is_what_the_system_says() -> None:

@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 import torch
 
-from learner import dqn, qnet
+from learner import bare, dqn, qnet
 from learner.intake import TrainingError
 from learner.trainer import Trainer, copy_due
 from tmc.kernel.config import build
@@ -239,3 +239,66 @@ def test_each_policy_has_a_newer_version_and_says_what_it_is(small, trainer_of, 
 def test_metrics_are_plain_floats(small, trainer_of, minibatch_of):
     metrics = trainer_of(small()).update(minibatch_of(small()))
     assert all(type(v) is float and math.isfinite(v) for k, v in vars(metrics).items() if k != "updates")
+
+
+def batches_with_repeats(minibatch_of, config, count, **fields):
+    """Minibatches in which most transitions come back, in other company, as those of a memory do."""
+    pool, rng = minibatch_of(config, 77, b=24, **fields), np.random.Generator(np.random.Philox(5))
+    names = [name for name, value in vars(pool).items() if isinstance(value, np.ndarray)]
+    for number in range(count):
+        rows = rng.integers(0, 24, 16)
+        yield minibatch_of(config, number, b=16, **{name: getattr(pool, name)[rows] for name in names})
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_values_that_are_kept_change_nothing(small, trainer_of, minibatch_of, double):
+    """Against the bare loop, which computes every value every time; theta- follows in between."""
+    config = small({"dqn.target_episodes": 0, "dqn.target_updates": 10, "dqn.double": double})
+    ours, rounding, moved = bare.departures(config, batches_with_repeats(minibatch_of, config, 60))
+    assert ours <= max(10 * rounding, 1e-6)
+    assert moved > 0.01
+
+
+def passes(trainer, batches):
+    """How many rows the target network computes in each update."""
+    rows = []
+    hook = trainer.target.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0])))
+    counts = []
+    for batch in batches:
+        rows.clear()
+        trainer.update(batch)
+        counts.append(sum(rows))
+    hook.remove()
+    return counts
+
+
+def test_a_value_is_computed_once_until_the_target_follows(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small({"dqn.target_episodes": 0, "dqn.target_updates": 3}))
+    batch = minibatch_of(trainer.config)
+    assert passes(trainer, [batch] * 7) == [6, 0, 0, 6, 0, 0, 6]
+
+
+@pytest.mark.parametrize("lose", ["forget", "load"])
+def test_nothing_is_known_of_transitions_that_are_numbered_anew(small, trainer_of, minibatch_of, lose):
+    """The same numbers stand for other transitions after that: the update must be that of a trainer who knows none."""
+    trainer, fresh = trainer_of(small()), trainer_of(small())
+    old, new = minibatch_of(trainer.config, 1), minibatch_of(trainer.config, 2, index=minibatch_of(small(), 1).index)
+    trainer.update(old)
+    fresh.load(trainer.state())
+    trainer.forget() if lose == "forget" else trainer.load(fresh.state())
+    assert trainer.update(new) == fresh.update(new)
+    assert same(trainer, fresh)
+
+
+def test_two_transitions_with_one_place_are_told_apart(small, trainer_of, minibatch_of):
+    config = small({"replay.capacity": 4, "replay.learn_start": 1, "dqn.target_episodes": 1000})
+    ours, rounding, _ = bare.departures(config, batches_with_repeats(minibatch_of, config, 20))
+    assert ours <= max(10 * rounding, 1e-6)
+
+
+def test_transitions_without_numbers_are_refused(small, trainer_of, minibatch_of):
+    trainer, untouched = trainer_of(small()), trainer_of(small())
+    for index in (np.zeros(5, "<i8"), np.full(6, -1, "<i8")):
+        with pytest.raises(TrainingError, match="not numbered"):
+            trainer.update(minibatch_of(trainer.config, index=index))
+    assert same(trainer, untouched)

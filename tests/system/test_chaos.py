@@ -19,7 +19,7 @@ def storm(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
     """The trial's row; nothing but progress may have gone to stderr."""
     done = overfly("verify", "chaos", *options)
     assert done.returncode == code, done.stdout + done.stderr
-    assert done.stderr and all(line.startswith("kill ") for line in done.stderr.splitlines())
+    assert done.stderr and all(line.startswith(("kill ", "mission-")) for line in done.stderr.splitlines())
     row: dict[str, Any] = json.loads(done.stdout)
     return row
 
@@ -51,6 +51,14 @@ def test_power_cuts_take_nothing_that_was_acknowledged(overfly: Overfly) -> None
     row = storm(overfly, "--mode", "fly", "--power", "--kills", "5", "--storm", "2", *SHORT)
     assert row["faults"] == [] and row["kills"]["power"] >= 1 and row["back"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
+
+
+@pytest.mark.slow
+def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly, tmp_path: Path) -> None:
+    """The counter-check: a journal that only survives the end of its process."""
+    options = ("--power", "--set", "journal.durability=process", "--kills", "4", "--storm", "2", *SHORT)
+    row = storm(overfly, "--mode", "fly", *options, "--keep", str(tmp_path / "kept"), code=1)
+    assert row["lost"] > 0 and row["bytes_cut"] > 0
 
 
 @pytest.mark.slow

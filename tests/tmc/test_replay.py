@@ -235,3 +235,19 @@ def test_a_capacity_below_the_team_is_not_exceeded_in_silence(town: RoadMap) -> 
         arrays = (zeros.astype("u2"), zeros.astype("u1"), zeros.astype("f4"), zeros.astype(np.int64))
         replay.add_rows(1, t, *arrays, [True])
     assert len(replay) <= 3
+
+
+def test_a_transition_keeps_its_number_and_no_other_ever_has_it(mission: Callable[..., Any], town: RoadMap) -> None:
+    """While the memory forgets and refills: what the learner knows by number must be of the same transition."""
+    values = {"training.ticks": 23, "training.episodes": 4, "team.size": 3, "replay.capacity": 40}
+    flown = mission({**values, "replay.learn_start": 1}, town)
+    known: dict[int, bytes] = {}
+    drawn = 0
+    for what, _ in flown.steps(Random(4)):
+        if what == "up" and len(flown.station.replay):
+            s = flown.station.replay.sample(drawn, 64)
+            drawn += 64
+            for b, number in enumerate(s.index.tolist()):
+                whole = s.observation[b].tobytes() + s.next_observation[b].tobytes() + s.allowed[b].tobytes()
+                assert known.setdefault(number, whole + s.action[b].tobytes()) == whole + s.action[b].tobytes()
+    assert drawn > 64 * 10 and len(known) > 3 * 40

@@ -52,6 +52,18 @@ def peers_of(observer: Observer, cell: int, team: list[int], me: int) -> list[in
     ]
 
 
+def test_an_image_drawn_over_in_place_has_the_same_bits(view: dict[str, Any], world_of: Worlds) -> None:
+    """Whatever was on it before."""
+    world = world_of({"team.size": TEAM, **view})
+    observer = Observer(world)
+    canvas, image = observer.canvas(), observer.canvas().image
+    for cell, team, me, u in zip(*states(world, seed=7), strict=True):
+        peers = peers_of(observer, int(cell), team.tolist(), int(me))
+        canvas.draw(int(cell), peers, u)
+        assert canvas.image.tobytes() == observer.observe(int(cell), peers, u).tobytes()
+    assert not image.any()  # nobody else's
+
+
 @pytest.mark.parametrize("scenario", [1, 2])
 @pytest.mark.parametrize("settings", [{}, {"world.alpha_offroad": 0.001}, {"team.sensing_range": 3.0}])
 def test_single_and_batch_agree_bit_for_bit(
