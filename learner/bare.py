@@ -102,7 +102,10 @@ def departures(config: Config, minibatches: Iterable[Minibatch]) -> tuple[float,
 
     Then the same of two bare loops, one of which gets the rows of each minibatch in reverse: the same mathematics, and
     only sums in another order, so float32's rounding and nothing else. Last, how far the weights have moved at all.
+
+    On one thread, since the order of sums would otherwise depend on their number.
     """
+    torch.set_num_threads(1)
     grid = World(config).grid
     shape = view_shape(config, grid)
     trainer, bare, reverse = Trainer(config, shape, grid), Bare(config, shape), Bare(config, shape)

@@ -22,6 +22,7 @@ from statistics import median
 from actors.tracks import create_table
 from deploy import plan, settings
 from deploy.benches.replay import fill
+from deploy.benches.rollout import weigh_all
 from deploy.benches.row import Row
 from deploy.mission import check
 from deploy.progress import Observer
@@ -31,11 +32,12 @@ from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.world import World
 from tmc.record.reader import Log, decode, run_files
 from tmc.replay import Replay
+from tmc.wire import messages
 from tmc.wire.messages import Minibatch
 
 SCALED = {"replay.capacity": 1500, "dqn.target_episodes": 0, "dqn.target_updates": 75}
-ENDLESS = 1_000_000
-"""Episodes: the mission is stopped, not finished."""
+MISSION = {**SCALED, "training.episodes": 1_000_000}
+"""It is stopped, not finished."""
 POLL = 0.05
 """Seconds between two looks at the processes."""
 TUNED = "in the learner's environment"
@@ -45,9 +47,13 @@ TICK = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True)
 class Learned:
-    """A stretch of a mission: updates a second, the learner's idle share, and ms of the processor an update by role."""
+    """A stretch of a mission: updates and ticks a second; seconds from its start to the first update; MiB of all
+    processes; the learner's idle share; ms of the processor an update, by role."""
 
     rate: float
+    ticks: float
+    start: float
+    memory: float | None
     idle: float | None
     cpu: dict[str, float]
 
@@ -67,7 +73,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
     """Bare loop and mission in turns, then the comparison of results; one row a figure."""
     if args.repeats < 1 or not args.seconds > 0 or args.steps < 0:
         raise ConfigError("--repeats must be 1 or more, --seconds more than 0, and --steps 0 or more")
-    values = {**SCALED, "training.episodes": ENDLESS, "training.threads": args.threads, **settings.chosen(args)}
+    values = {**MISSION, "training.threads": args.threads, **settings.chosen(args)}
     world = check(settings.config_for("paper", values))
     bare: list[float] = []
     tuned: list[float] = []
@@ -77,7 +83,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
             bare.append(bare_loop(world.config, args.seconds, "bare"))
             flown.append(fly(world, args.seconds, Path(tempfile.mkdtemp(dir=scratch))))
             tuned.append(bare_loop(world.config, args.seconds, "learner"))
-            _say(f"bare loop {bare[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s")
+            say(f"bare loop {bare[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s")
     rows = list(_rows(world.config, flown, bare, tuned))
     return rows + (list(compare(world, args.steps)) if args.steps else [])
 
@@ -87,13 +93,19 @@ def _rows(config: Config, flown: list[Learned], bare: list[float], tuned: list[f
     for name, reference in (("bare loop", bare), (f"bare loop {TUNED}", tuned)):
         ratio = median(a / b for a, b in zip(rates, reference, strict=True))
         yield Row("learner", f"{case}", median(rates), "updates/s", median(reference), ratio, f"x {name}")
+    yield from shares("learner", case, flown)
+
+
+def shares(bench: str, case: str, flown: list[Learned]) -> Iterator[Row]:
+    """How long the learner waited, and who used the processor."""
     idle = [f.idle for f in flown if f.idle is not None]
-    yield Row("learner", f"{case} idle", median(idle) if idle else None, "share of time")
+    yield Row(bench, f"{case} idle", median(idle) if idle else None, "share of time")
     for role in flown[0].cpu:
-        yield Row("learner", f"{case} {role}", median(f.cpu[role] for f in flown), "ms of CPU an update")
+        yield Row(bench, f"{case} {role}", median(f.cpu[role] for f in flown), "ms of CPU an update")
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
+    """Progress."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -113,31 +125,39 @@ def fly(world: World, seconds: float, out: Path) -> Learned:
     """A mission in processes of its own; time is taken once the memory is full and theta- has changed."""
     config = world.config
     (out / "config.json").write_text(json.dumps(flat(config)))
+    warm = config.replay.capacity // config.team.size + config.dqn.target_updates
     mission = plan.make(config, out, policy=None)
-    supervisor = Supervisor(mission, out, config.training.threads, _say)
+    supervisor = Supervisor(mission, out, config.training.threads, say)
     observer = Observer(mission.endpoint)
     try:
         create_table(mission.tracks, config.team.size, config.training.ticks)
+        begun = time.monotonic()
         supervisor.start()
-        warm = config.replay.capacity // config.team.size + config.dqn.target_updates
-        began, updates = _wait(supervisor, observer, updates=warm)
+        first, _ = _wait(supervisor, observer, updates=1)
+        began, since = _wait(supervisor, observer, updates=warm)
         cpu = _cpu(supervisor.pids())
-        ended, more = _wait(supervisor, observer, until=began + seconds)
-        spent = {role: 1e3 * (s - cpu[role]) / (more - updates) for role, s in _cpu(supervisor.pids()).items()}
+        ended, until = _wait(supervisor, observer, until=began + seconds)
+        span, updates = ended - began, until.updates - since.updates
+        spent = {role: 1e3 * (s - cpu[role]) / updates for role, s in _cpu(supervisor.pids()).items()}
+        memory = weigh_all(supervisor.pids())
     finally:
         observer.close()
         supervisor.stop()
         supervisor.close()
-    return Learned((more - updates) / (ended - began), _idle(out, seconds), spent)
+    ticks = (until.ticks - since.ticks) / span
+    total = memory.total if memory else None
+    return Learned(updates / span, ticks, first - begun, total, _idle(out, seconds), spent)
 
 
-def _wait(supervisor: Supervisor, observer: Observer, updates: int = 0, until: float = 0.0) -> tuple[float, int]:
-    """(seconds of the clock, updates) when there have been `updates`, and the clock is past `until`."""
+def _wait(
+    supervisor: Supervisor, observer: Observer, updates: int = 0, until: float = 0.0
+) -> tuple[float, messages.Status]:
+    """(seconds of the clock, status) when there have been `updates`, and the clock is past `until`."""
     while True:
         supervisor.watch()
         status, now = observer.ask(), time.monotonic()
         if status is not None and status.updates >= updates and now >= until:
-            return now, status.updates
+            return now, status
         time.sleep(POLL)
 
 
@@ -146,8 +166,8 @@ def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
     spent = dict.fromkeys(("learner", "tmc", "uavs"), 0.0)
     for name, pid in pids.items():
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        role = "uavs" if name.startswith("uav-") else name
-        spent[role] = spent.get(role, 0.0) + (int(fields[11]) + int(fields[12])) / TICK
+        role = name if name in spent else "uavs"  # with the process that forks them
+        spent[role] += (int(fields[11]) + int(fields[12])) / TICK
     return spent
 
 
@@ -174,7 +194,7 @@ def compare(world: World, steps: int) -> Iterator[Row]:
 def _minibatches(replay: Replay, count: int) -> Iterator[Minibatch]:
     for number in range(count):
         if number % 200 == 199:
-            _say(f"{number + 1:,} of {count:,} steps compared")
+            say(f"{number + 1:,} of {count:,} steps compared")
         s = replay.sample(number, replay.world.config.dqn.batch)
         yield Minibatch(
             number, 0, 0, s.observation, s.action, s.reward, s.next_observation, s.discount, s.allowed, s.index

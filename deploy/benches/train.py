@@ -1,5 +1,5 @@
-"""`overfly bench train`: ticks a second of the whole recipe, one minibatch a tick, for some team sizes, in turns with the
-bare compute loop; how long a start takes, and what memory all processes use together.
+"""`overfly bench train`: ticks a second of the whole recipe, one minibatch a tick, against the bare compute loop; how
+long a start takes, and what memory all processes use together.
 
 The missions are those of `overfly bench learner`, which says why they stand for the paper's.
 """

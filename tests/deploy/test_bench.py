@@ -91,6 +91,15 @@ def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str
     )
 
 
+def test_train_counts_the_ticks_of_the_whole_recipe(capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["replay.capacity=200", "dqn.target_updates=10", "dqn.batch=16", "network.channels=4,4"]
+    changes = [part for change in small for part in ("--set", change)]
+    rows = rows_of(capsys, "train", "--repeats", "1", "--seconds", "1", "--threads", "1", "--actors", "2", *changes)
+    assert rows["N=2 x bare loop"]["value"] > 0
+    assert 0 < rows["N=2 start"]["value"] < 60
+    assert 50 < rows["N=2 memory"]["value"] < 4096
+
+
 @pytest.mark.parametrize(
     "mistake", [["learner", "--seconds", "0"], ["replay", "--minibatches", "0"], ["actor", "--repeats", "0"]]
 )

@@ -48,12 +48,18 @@ class Observer:
         flat = np.empty((3, self._window.shape[1]), np.float32) if out is None else out.reshape(3, -1)
         row = 0 if self._whole else cell
         flat[1] = self._terrain[row]
-        flat[2] = np.append(u, 0.0)[self._place[row]]
+        padded = np.zeros(u.size + 1)
+        padded[:-1] = u
+        flat[2] = padded[self._place[row]]
         flat[0] = 0.0
         for peer in peers:
             self._mark(flat[0], cell, peer, PEER)
         self._mark(flat[0], cell, cell, EGO)
         return flat.reshape(self.shape)
+
+    def canvas(self) -> Canvas:
+        """An image of its own for one who looks again and again."""
+        return Canvas(self, self._monitored if self._whole else None)
 
     def _mark(self, plane: Floats, cell: int, where: int, value: float) -> None:
         if self._whole:
@@ -116,3 +122,30 @@ class Observer:
         peers = np.where(sensed, team, -2)
         held = (targets[:, :, None] == peers[:, None, :]).any(axis=2)
         return np.asarray(self.free[cells] & ~held, np.uint8)
+
+
+class Canvas:
+    """One image that is drawn over in place, the same bits as `Observer.observe`: what stays is not drawn again.
+
+    `monitored`: the cells of U in a view of the whole grid; None where the view moves with the UAV.
+    """
+
+    def __init__(self, observer: Observer, monitored: Ints | None) -> None:
+        self.image = np.zeros((1, *observer.shape), np.float32)
+        """Shape (1, C, H, W), always the same memory."""
+        self._observer, self._monitored = observer, monitored
+        self._here, _, self._u = self.image.reshape(3, -1)
+        self._marked: list[int] | None = None
+
+    def draw(self, cell: int, peers: list[int], u: NDArray[np.float64]) -> None:
+        """Make it o_i(t); arguments as for `Observer.observe`."""
+        if self._monitored is None or self._marked is None:
+            self._observer.observe(cell, peers, u, self.image[0])
+        else:
+            for where in self._marked:
+                self._here[where] = 0.0
+            for where in peers:
+                self._here[where] = PEER
+            self._here[cell] = EGO
+            self._u[self._monitored] = u
+        self._marked = [cell, *peers]
