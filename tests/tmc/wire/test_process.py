@@ -185,7 +185,7 @@ def test_a_mistake_in_a_process_is_exit_code_2_without_a_traceback(start: Start)
     child = start(code)
     out, err = child.communicate(timeout=PATIENCE)
     assert (child.returncode, out) == (2, "")
-    assert err == "overfly: team.size = 0 is out of range: choose 1 to 1000\n"
+    assert err == "overfly: team.size = 0 is out of range: choose 1 to 1,000\n"
 
 
 def test_exit_codes_can_be_told_apart() -> None:
