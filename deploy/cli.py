@@ -9,7 +9,6 @@ import os
 import signal
 import sys
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 from tmc.wire import process
@@ -29,7 +28,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("fly", "deploy.commands.fly", "fly a mission with a fixed policy or a planner, no learner"),
     Command("evaluate", "deploy.commands.evaluate", "compare policies and planners over many seeds"),
     Command("verify", "deploy.commands.verify", "put to the test: exactness, asynchrony, chaos"),
-    Command("bench", "deploy.commands.bench", "measure this machine: rollout, journal"),
+    Command("bench", "deploy.commands.bench", "measure this machine: speed, start, memory, each beside a reference"),
     Command("analyze", "deploy.commands.analyze", "a run's summary and pictures, from its log"),
     Command("log", "deploy.commands.log", "a run's logs: read, check, recover, seal, merge, replay"),
     Command("map", "deploy.commands.map", "the maps: list, show, export, check"),
@@ -51,10 +50,20 @@ def mistakes() -> tuple[type[Exception], ...]:
     return ConfigError, PolicyError, MapError, RecordError, EndpointError
 
 
+class _Version(argparse.Action):
+    """Looks the version up only when it is asked for: that takes as long as all else at the start of the command."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version  # noqa: PLC0415
+
+        print(f"overfly {version('overfly')}")
+        parser.exit()
+
+
 def parser_for(chosen: str | None) -> argparse.ArgumentParser:
     """The parser; only the chosen command's module is imported for its options."""
     parser = argparse.ArgumentParser("overfly", description="A team of UAV processes learns to patrol a road network.")
-    parser.add_argument("--version", action="version", version=f"overfly {version('overfly')}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in COMMANDS:
         sub = commands.add_parser(command.name, help=command.about, description=command.about)

@@ -1,4 +1,4 @@
-"""The supervisor's side of the forkserver (actors/forkserver.py): processes that are forked, used as `Popen` is."""
+"""The supervisor's side of the forkserver (deploy/forkserver.py): processes that are forked, used as `Popen` is."""
 
 from __future__ import annotations
 
@@ -144,8 +144,8 @@ class Forked:
         return self.returncode
 
 
-def forkserver_command(out: Path, preload: Sequence[str], room: int) -> tuple[str, ...]:
-    """The forkserver's command line, with `room` characters for the command line of a child."""
+def forkserver_command(package: str, out: Path, preload: Sequence[str], room: int) -> tuple[str, ...]:
+    """The command line of the forkserver of `package`, with `room` characters for the command line of a child."""
     loads = [word for module in preload for word in ("--preload", module)]
-    command = (sys.executable, "-P", "-m", "actors.forkserver", "--out", str(out), "--parent", str(os.getpid()))
-    return (*command, *loads, "--room", "." * room)
+    command = (sys.executable, "-P", "-m", "deploy.forkserver", "--of", package)
+    return (*command, "--out", str(out), "--parent", str(os.getpid()), *loads, "--room", "." * room)

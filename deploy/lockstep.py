@@ -100,8 +100,13 @@ class LockStep:
     def _learn(self) -> bool:
         """Train on every minibatch that the limiter lets through; True when there was one."""
         trainer, learned = self.trainer, False
-        while trainer is not None and self._minibatches:
-            metrics = trainer.update(self._minibatches.pop(0))
+        if trainer is None or not self._minibatches:
+            return False
+        from learner.intake import Intake  # noqa: PLC0415  torch only where something is learned
+
+        intake = Intake(self.station.observer)
+        while self._minibatches:
+            metrics = trainer.update(intake.read(self._minibatches.pop(0)))
             learned = True
             if metrics.updates % self.world.config.training.push_every == 0:
                 self._push(metrics.loss)

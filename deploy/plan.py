@@ -7,8 +7,9 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
@@ -26,28 +27,29 @@ ROOT = Path(deploy.__file__).resolve().parent.parent
 class Child:
     """One process: its name, its command, whether it may be started again, and whether its end ends the mission.
 
-    `forked`: the forkserver starts it, and `command` holds the arguments of `python -m actors` alone.
+    `fork_of`: the package whose forkserver starts it; `command` then holds the arguments of `python -m PACKAGE` alone.
     """
 
     name: str
     command: tuple[str, ...]
     restart: bool
     leads: bool = False
-    forked: bool = False
+    fork_of: str = ""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The processes of a mission on this machine, and what they share. `preload`: what all UAVs import.
+    """The processes of a mission on this machine, and what they share.
 
-    `held`: a file in `scratch`, locked for as long as it is open.
+    `preload`: what the forkserver of a package imports besides its `__main__`. `held`: a file in `scratch`, locked
+    for as long as it is open.
     """
 
     children: tuple[Child, ...]
     endpoint: str
     tracks: Path
     scratch: Path
-    preload: tuple[str, ...] = ()
+    preload: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     held: IO[bytes] | None = None
 
 
@@ -59,18 +61,19 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
     scratch, held = _new_scratch()
     endpoint, tracks = f"ipc://{scratch}/sync", scratch / "tracks"
     flies_fixed = policy is not None or config.team.pilot != "policy"
-    common = ("--parent", str(os.getpid()), "--out", str(out))
-    tmc = [*_module("tmc"), "--config", str(out / "config.json"), "--bind", endpoint, "--resume", *common]
+    tmc = [sys.executable, "-P", "-m", "tmc"]  # -P: the user's folder may hold packages of the same names
+    tmc += ["--config", str(out / "config.json"), "--bind", endpoint, "--resume"]
+    tmc += ["--parent", str(os.getpid()), "--out", str(out)]
     tmc += ["--tracks", str(tracks)] if table else []
     tmc += ["--policy", str(policy)] if policy else []
     children = [Child("tmc", tuple(tmc), restart=True, leads=True)]
+    common = ("--connect", endpoint, "--out", str(out))
     if not flies_fixed:
-        children.append(Child("learner", (*_module("learner"), "--connect", endpoint, *common), restart=True))
+        children.append(Child("learner", common, restart=True, fork_of="learner"))
     for i in range(config.team.size):
-        command = ("--id", str(i), "--connect", endpoint, "--out", str(out))
-        children.append(Child(f"uav-{i:03d}", command, restart=True, forked=True))
+        children.append(Child(f"uav-{i:03d}", ("--id", str(i), *common), restart=True, fork_of="actors"))
     # A planner flies without ONNX Runtime, 16 MB of memory that nobody would use.
-    preload = () if config.team.pilot.startswith(PREFIX) else ("actors.policy",)
+    preload = {} if config.team.pilot.startswith(PREFIX) else {"actors": ("actors.policy",)}
     return Plan(tuple(children), endpoint, tracks, scratch, preload, held)
 
 
@@ -90,24 +93,20 @@ def _new_scratch() -> tuple[Path, IO[bytes]]:
     return scratch, held
 
 
-def _module(name: str) -> tuple[str, ...]:
-    # -P: the folder that the user stands in may hold packages of the same names.
-    return (sys.executable, "-P", "-m", name)
-
-
 def _short_folder() -> str | None:
     """Memory-backed where there is such a folder: the track table must not wait for a disk."""
     shm = Path("/dev/shm")
     return str(shm) if shm.is_dir() and os.access(shm, os.W_OK) else None
 
 
-# The learner frees and takes the same large blocks in every update: keep them instead of returning them to the system
-# (an update of the paper's network then has no page faults instead of 1,650).
+# TMC and learner free and take the same large blocks for every minibatch: keep them instead of returning them to the
+# system (an update of the paper's network then has no page faults instead of 1,650).
 KEEP_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**29), "MALLOC_MMAP_THRESHOLD_": str(2**29)}
 
 
 def environment(name: str, threads: int) -> dict[str, str]:
     """A child's environment: it finds our packages, and does not start more threads than it is given."""
     path = os.pathsep.join(p for p in (str(ROOT), os.environ.get("PYTHONPATH", "")) if p)
-    counts = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
-    return os.environ | counts | {"PYTHONPATH": path} | (KEEP_MEMORY if name == "learner" else {})
+    counts = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
+    counts["OPENBLAS_NUM_THREADS"] = "1"  # NumPy's: no use for more, and it would start them before the fork
+    return os.environ | counts | {"PYTHONPATH": path} | (KEEP_MEMORY if name in ("tmc", "learner") else {})

@@ -49,15 +49,22 @@ class Supervisor:
     def __init__(self, plan: plans.Plan, out: Path, threads: int, say: Callable[[str], None]) -> None:
         self.plan, self.out, self.threads, self.say = plan, out, threads, say
         self.running = [_Running(child) for child in plan.children]
-        room = max((len(" ".join(c.command)) for c in plan.children if c.forked), default=0) + 64
-        command, environment = forkserver_command(out, plan.preload, room), plans.environment("actors", 1)
-        self._forkserver = ForkServer(command, environment, self.log_of("forkserver"))
+        self._forkservers = {name: self._forkserver(name) for name in {c.fork_of for c in plan.children} - {""}}
 
     def start(self) -> None:
         """Start everybody."""
         (self.out / "logs").mkdir(exist_ok=True)
         for running in self.running:
             self._start(running)
+
+    def _forkserver(self, package: str) -> ForkServer:
+        """The forkserver of a package; it starts with the first process that it forks."""
+        room = max(len(" ".join(c.command)) for c in self.plan.children if c.fork_of == package) + 64
+        command = forkserver_command(package, self.out, self.plan.preload.get(package, ()), room)
+        return ForkServer(command, self._environment(package), self.log_of(f"forkserver-{package}"))
+
+    def _environment(self, name: str) -> dict[str, str]:
+        return plans.environment(name, self.threads if name == "learner" else 1)
 
     def log_of(self, name: str) -> Path:
         """Where a process's own output goes."""
@@ -66,17 +73,16 @@ class Supervisor:
     def _start(self, running: _Running) -> None:
         child, log = running.child, self.log_of(running.child.name)
         running.started = time.monotonic()
-        if child.forked:
-            running.handle = self._forkserver.start(child.name, child.command, log)
+        if child.fork_of:
+            running.handle = self._forkservers[child.fork_of].start(child.name, child.command, log)
             return
-        threads = self.threads if child.name == "learner" else 1
         with log.open("ab") as output:
             running.handle = subprocess.Popen(
                 child.command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                env=plans.environment(child.name, threads),
+                env=self._environment(child.name),
                 start_new_session=True,  # Ctrl-C in the terminal is for the supervisor, who ends all in order
             )
 
@@ -137,9 +143,10 @@ class Supervisor:
                 running.handle.wait()
 
     def pids(self) -> dict[str, int]:
-        """The processes that run now, and that of the forkserver."""
+        """The processes that run now, and the forkservers, each as `forkserver-` and its package."""
         handles = {r.child.name: r.handle for r in self.running if r.handle is not None and r.handle.poll() is None}
-        found = {name: handle.pid for name, handle in handles.items()} | {"forkserver": self._forkserver.pid}
+        found = {name: handle.pid for name, handle in handles.items()}
+        found |= {f"forkserver-{package}": server.pid for package, server in self._forkservers.items()}
         return {name: pid for name, pid in found.items() if pid is not None}
 
     def exit_codes(self) -> dict[str, int | None]:
@@ -151,8 +158,9 @@ class Supervisor:
         return {r.child.name: r.restarts for r in self.running if r.restarts}
 
     def close(self) -> None:
-        """End the forkserver, and remove what the processes shared."""
-        self._forkserver.close()
+        """End the forkservers, and remove what the processes shared."""
+        for server in self._forkservers.values():
+            server.close()
         with contextlib.suppress(OSError):
             shutil.rmtree(self.plan.scratch)
         if self.plan.held is not None:

@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from learner import dqn, qnet
+from learner.intake import Batch
 from learner.trainer import Trainer, channels_last, copy_due
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.policy import view_shape
 from tmc.kernel.world import World
-from tmc.wire.messages import Minibatch
 
 WARM = 10
 """Updates before time is taken."""
@@ -48,7 +48,7 @@ class Bare:
             return
         self.target.load_state_dict(self.online.state_dict())
 
-    def update(self, batch: Batch) -> None:
+    def update(self, batch: Tensors) -> None:
         """One step of Adam on eq. (9)."""
         d = self.config.dqn
         with torch.no_grad():
@@ -63,30 +63,30 @@ class Bare:
         self.updates += 1
 
 
-class Batch:
+class Tensors:
     """A minibatch as tensors; `layout` (torch's memory format): how its images lie in memory."""
 
-    def __init__(self, minibatch: Minibatch, layout: torch.memory_format = torch.contiguous_format) -> None:
-        images = (minibatch.observation, minibatch.next_observation)
+    def __init__(self, batch: Batch, layout: torch.memory_format = torch.contiguous_format) -> None:
+        images = (batch.observation, batch.next_observation(np.arange(len(batch.action))))
         self.o, self.o_next = (torch.tensor(image).contiguous(memory_format=layout) for image in images)
-        self.action, self.allowed = torch.tensor(minibatch.action).long(), torch.tensor(minibatch.allowed)
-        self.reward, self.discount = torch.tensor(minibatch.reward), torch.tensor(minibatch.discount)
+        self.action, self.allowed = torch.tensor(batch.action).long(), torch.tensor(batch.allowed)
+        self.reward, self.discount = torch.tensor(batch.reward), torch.tensor(batch.discount)
 
 
-def resident(config: Config, shape: qnet.Shape) -> Minibatch:
+def resident(config: Config, shape: qnet.Shape) -> Batch:
     """A minibatch of noise, for timing: what is in it does not change what is computed."""
     rng, b = np.random.Generator(np.random.Philox(1)), config.dqn.batch
     o, o_next = (rng.random((b, *shape), np.float32) for _ in range(2))
     action, reward = rng.integers(0, N_ACTIONS, b).astype("u1"), rng.random(b, np.float32)
     discount, allowed = np.full(b, config.dqn.gamma, "<f4"), np.ones((b, N_ACTIONS), "u1")
-    return Minibatch(0, 0, 0, o, action, reward, o_next, discount, allowed, np.arange(b))
+    return Batch(0, o, lambda rows: o_next[rows], action, reward, discount, allowed, np.arange(b))
 
 
 def rate(config: Config, seconds: float) -> float:
     """Updates a second of the bare loop, on as many threads as the settings say."""
     torch.set_num_threads(config.training.threads)
     shape = view_shape(config, World(config).grid)
-    bare, batch = Bare(config, shape), Batch(resident(config, shape))
+    bare, batch = Bare(config, shape), Tensors(resident(config, shape))
     for _ in range(WARM):
         bare.update(batch)
     start = time.perf_counter()
@@ -95,7 +95,7 @@ def rate(config: Config, seconds: float) -> float:
     return (bare.updates - WARM) / (time.perf_counter() - start)
 
 
-def departures(config: Config, minibatches: Iterable[Minibatch]) -> tuple[float, float]:
+def departures(config: Config, batches: Iterable[Batch]) -> tuple[float, float]:
     """How far the trainer's gradients are from the bare loop's, relative to their length: the largest of all updates.
 
     Before each update the bare loop gets the trainer's theta (its theta- follows by itself): left alone, the two drift
@@ -110,12 +110,12 @@ def departures(config: Config, minibatches: Iterable[Minibatch]) -> tuple[float,
     trainer, bare, turned = Trainer(config, shape, grid), Bare(config, shape), Bare(config, shape)
     channels_last(turned.online), channels_last(turned.target)
     ours = rounding = 0.0
-    for minibatch in minibatches:
+    for batch in batches:
         for loop, layout in ((bare, torch.contiguous_format), (turned, torch.channels_last)):
             loop.online.load_state_dict(trainer.online.state_dict())
-            loop.follow(minibatch.episodes)
-            loop.update(Batch(minibatch, layout))
-        trainer.update(minibatch)
+            loop.follow(batch.episodes)
+            loop.update(Tensors(batch, layout))
+        trainer.update(batch)
         true = gradient(bare.online)
         ours = max(ours, float((gradient(trainer.online) - true).norm() / true.norm()))
         rounding = max(rounding, float((gradient(turned.online) - true).norm() / true.norm()))

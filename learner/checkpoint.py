@@ -55,6 +55,15 @@ class Meta:
     config: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Saved:
+    """A checkpoint that was read: the name of its file, what it says of itself, and what it holds."""
+
+    name: str
+    meta: Meta
+    state: State
+
+
 def save(folder: Path, trainer: Trainer) -> Path:
     """Write `checkpoint-<updates>.safetensors` in one step; keep it and the two before it. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -98,19 +107,17 @@ def _numbered(folder: Path) -> list[tuple[int, Path]]:
     return sorted(((int(n), path) for n, path in names if n.isdecimal()), reverse=True)
 
 
-def newest(folder: Path) -> Path | None:
+def newest(folder: Path) -> Saved | None:
     """The checkpoint with the most updates that can be read, or None; each damaged one is skipped with a warning."""
     for _, path in _numbered(folder):
         try:
-            read(path)
+            return read(path)
         except CheckpointError as error:
             log.warning("skipped: %s", error)
-        else:
-            return path
     return None
 
 
-def read(path: Path) -> tuple[Meta, State]:
+def read(path: Path) -> Saved:
     """What a checkpoint holds. Raises CheckpointError for one that is damaged or of a foreign format."""
     damaged = f"the checkpoint {path.name} is damaged or cut short: delete it to go on from an older one"
     try:
@@ -128,18 +135,17 @@ def read(path: Path) -> tuple[Meta, State]:
     if notes.get(DIGEST) != digest(text, tensors):
         raise CheckpointError(damaged)
     meta = Meta(**json.loads(text))
-    return meta, State(tensors, meta.updates, meta.version, meta.copied)
+    return Saved(path.name, meta, State(tensors, meta.updates, meta.version, meta.copied))
 
 
-def load(path: Path, trainer: Trainer) -> None:
+def load(saved: Saved, trainer: Trainer) -> None:
     """Make the trainer go on from a checkpoint. Raises CheckpointError, and leaves the trainer as it was."""
-    meta, state = read(path)
-    difference = _difference(meta, trainer)
+    difference = _difference(saved.meta, trainer)
     if difference:
-        raise CheckpointError(f"the checkpoint {path.name} {difference}: choose the settings it was made with")
-    if layout(state.tensors) != layout(trainer.state().tensors):
-        raise CheckpointError(f"the checkpoint {path.name} has other weights than the network: start without it")
-    trainer.load(state)
+        raise CheckpointError(f"the checkpoint {saved.name} {difference}: choose the settings it was made with")
+    if layout(saved.state.tensors) != layout(trainer.state().tensors):
+        raise CheckpointError(f"the checkpoint {saved.name} has other weights than the network: start without it")
+    trainer.load(saved.state)
 
 
 def _difference(meta: Meta, trainer: Trainer) -> str:

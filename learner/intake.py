@@ -1,38 +1,98 @@
-"""What the learner takes in: a minibatch off the wire, checked, as tensors."""
+"""What the learner takes in: a minibatch off the wire, checked, its observations drawn."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.qnet import Shape
 from tmc.kernel.grid import N_ACTIONS
-from tmc.wire.messages import Array, Minibatch
+from tmc.kernel.observation import Floats, Ints, Observer, Views
+from tmc.wire.messages import Minibatch
 
 
 class TrainingError(ValueError):
     """An update that cannot be made: one sentence with the mend. It leaves theta and Adam as they were."""
 
 
-def images(observation: Array) -> Tensor:
-    """(B, C, H, W) float32 as the convolutions like it; copied, since an array off the wire is read-only."""
-    return torch.tensor(observation).contiguous(memory_format=torch.channels_last)
+@dataclass(frozen=True)
+class Batch:
+    """A minibatch with images. `observation`: (b, C, H, W); `next_observation(rows)`: those of o_{t+n} asked for.
+
+    Both may lie in memory that the next batch is drawn over. The other fields are those of `Minibatch`.
+    """
+
+    episodes: int
+    observation: Floats
+    next_observation: Callable[[Ints], Floats]
+    action: NDArray[np.uint8]
+    reward: Floats
+    discount: Floats
+    allowed: NDArray[np.uint8]
+    index: NDArray[np.int64]
 
 
-def check(minibatch: Minibatch, shape: Shape) -> None:
-    """Raise TrainingError unless the fields of the minibatch fit together and fit the network."""
-    b = len(minibatch.action)
-    images_, rows = (b, *shape), (minibatch.reward, minibatch.discount)
-    if minibatch.observation.shape != images_ or minibatch.next_observation.shape != images_ or not b:
+class Intake:
+    """Draws the observations of minibatches, into the same memory each time and as the convolutions like them."""
+
+    def __init__(self, observer: Observer) -> None:
+        self.observer = observer
+        channels, height, width = observer.shape
+        self._sides, self._channels = (height, width), channels
+        self._now = self._next = np.empty((0, *observer.shape), np.float32)
+
+    def read(self, minibatch: Minibatch) -> Batch:
+        """The batch; the one before must not be used any more. Raises TrainingError for what cannot be drawn."""
+        views, b = self._views(minibatch), len(minibatch.action)
+        if len(self._now) != b:
+            self._now, self._next = self._memory(b), self._memory(b)
+
+        def following(rows: Ints) -> Floats:
+            return self.observer.observe_batch(views.rows(b + rows), self._next[: rows.size])
+
+        now = self.observer.observe_batch(views.rows(slice(b)), self._now)
+        m = minibatch
+        return Batch(m.episodes, now, following, m.action, m.reward, m.discount, m.allowed, m.index)
+
+    def _memory(self, b: int) -> Floats:
+        """Shape (b, C, H, W), in memory (b, H, W, C)."""
+        return np.empty((b, *self._sides, self._channels), np.float32).transpose(0, 3, 1, 2)
+
+    def _views(self, minibatch: Minibatch) -> Views:
+        m, b, K = minibatch, len(minibatch.action), self.observer.grid.size
+        if not b or m.cells.shape != (2 * b,) or m.peers.shape[0] != 2 * b or m.u.shape != (2 * b, self.observer.R):
+            raise TrainingError(
+                f"the minibatch has maps of shape {m.u.shape}, this mission needs ({2 * b}, {self.observer.R}): "
+                "start the learner with the settings of the TMC"
+            )
+        if int(m.cells.max()) >= K or int(m.peers.max(initial=0)) > K:
+            raise TrainingError(f"the minibatch has a UAV outside the grid of {K} cells")
+        return Views(m.cells, m.peers, m.u)
+
+
+def laid_out(images: Floats) -> Tensor:
+    """(B, C, H, W) float32, channels last; the same memory where it lies so already."""
+    return torch.from_numpy(images).contiguous(memory_format=torch.channels_last)
+
+
+def check(batch: Batch, shape: Shape) -> None:
+    """Raise TrainingError unless the fields of the batch fit together and fit the network."""
+    b = len(batch.action)
+    if batch.observation.shape != (b, *shape) or not b:
         raise TrainingError(
-            f"the minibatch has observations of shape {minibatch.observation.shape}, the network needs {images_}: "
+            f"the minibatch has observations of shape {batch.observation.shape}, the network needs {(b, *shape)}: "
             "start the learner with the settings of the TMC"
         )
-    if any(r.shape != (b,) for r in rows) or minibatch.allowed.shape != (b, N_ACTIONS):
+    if any(r.shape != (b,) for r in (batch.reward, batch.discount)) or batch.allowed.shape != (b, N_ACTIONS):
         raise TrainingError(f"the minibatch's fields differ in length: each must have {b} rows")
-    if minibatch.index.shape != (b,) or int(minibatch.index.min()) < 0:
+    if batch.index.shape != (b,) or int(batch.index.min()) < 0:
         raise TrainingError(f"the minibatch's transitions are not numbered: `index` must have {b} numbers from 0 on")
-    if int(minibatch.action.max()) >= N_ACTIONS:
-        raise TrainingError(f"the minibatch has an action {minibatch.action.max()}: a UAV has {N_ACTIONS}")
-    if not minibatch.allowed.any(axis=1).all():
+    if int(batch.action.max()) >= N_ACTIONS:
+        raise TrainingError(f"the minibatch has an action {batch.action.max()}: a UAV has {N_ACTIONS}")
+    if not batch.allowed.any(axis=1).all():
         raise TrainingError("the minibatch has a state with no allowed action: staying is always allowed")

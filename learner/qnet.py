@@ -41,6 +41,8 @@ class QNet(nn.Module):
         x = o
         for conv in self.convs:
             x = torch.relu(conv(x))
+        if x.requires_grad and not x.is_contiguous():
+            x.register_hook(as_filters_like)  # type: ignore[no-untyped-call]
         x = x.flatten(1)
         if self.near:
             x = torch.cat((x, self.crop(o).flatten(1)), dim=1)
@@ -51,6 +53,11 @@ class QNet(nn.Module):
         """The middle of the observation: (B, C, 2 near + 1, 2 near + 1)."""
         (top, bottom), (left, right) = (middle(side, self.near) for side in self.shape[1:])
         return o[:, :, top:bottom, left:right]
+
+
+def as_filters_like(gradient: Tensor) -> Tensor:
+    """The same gradient, channels last: as `flatten` hands it back it would cost 6 % of an update."""
+    return gradient.contiguous(memory_format=torch.channels_last)
 
 
 def middle(side: int, near: int) -> tuple[int, int]:

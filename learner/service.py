@@ -12,8 +12,11 @@ from typing import Any
 import zmq
 
 from learner import checkpoint
+from learner.checkpoint import Saved
+from learner.intake import Intake
 from learner.trainer import UpdateMetrics, start
 from tmc.kernel.config import build
+from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
 from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
@@ -46,10 +49,11 @@ class Service:
 
     def learn(self, stop: Callable[[], bool]) -> bool:
         """The main loop; True when the mission came to its end, False when stopped. Leaves checkpoint and policy."""
-        welcome = self._join(stop)
+        saved = checkpoint.newest(self.out / "checkpoints")
+        welcome = self._join(saved, stop)
         if welcome is None:
             return False
-        self._prepare(welcome)
+        self._prepare(welcome, saved)
         self._push()
         for _ in range(WINDOW):
             self._ask()
@@ -60,12 +64,10 @@ class Service:
         self._finish()
         return over
 
-    def _join(self, stop: Callable[[], bool]) -> m.Welcome | None:
+    def _join(self, saved: Saved | None, stop: Callable[[], bool]) -> m.Welcome | None:
         """Say hello until the TMC answers."""
-        saved = checkpoint.newest(self.out / "checkpoints")
-        updates = checkpoint.read(saved)[0].updates if saved else 0
         while not stop():
-            sockets.send(self.sock, m.Hello("learner", -1, self.life, updates))
+            sockets.send(self.sock, m.Hello("learner", -1, self.life, saved.meta.updates if saved else 0))
             if self.sock.poll(1000):
                 message = self._receive()
                 if isinstance(message, m.Welcome):
@@ -76,14 +78,14 @@ class Service:
                     return None
         return None
 
-    def _prepare(self, welcome: m.Welcome) -> None:
+    def _prepare(self, welcome: m.Welcome, saved: Saved | None) -> None:
         config = build(json.loads(welcome.config))
         self._own(welcome.run)
         self.config = config
-        self.trainer = start(config, World(config).grid)
+        world = World(config)
+        self.trainer, self.intake = start(config, world.grid), Intake(Observer(world))
         self.out.mkdir(parents=True, exist_ok=True)
         self.log = LogWriter(self.out / "learner.mcap", "learner", config.journal, {"run": welcome.run}, resume=True)
-        saved = checkpoint.newest(self.out / "checkpoints")
         if saved is not None:
             checkpoint.load(saved, self.trainer)
             self.log.log("info", f"goes on from {saved.name}")
@@ -136,7 +138,7 @@ class Service:
         sockets.send(self.sock, m.SampleRequest(self._request))
 
     def _update(self, minibatch: m.Minibatch) -> None:
-        metrics = self.trainer.update(minibatch)
+        metrics = self.trainer.update(self.intake.read(minibatch))
         self._loss = metrics.loss
         if metrics.updates % self.config.training.push_every == 0:
             self._push()

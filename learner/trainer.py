@@ -14,15 +14,16 @@ import torch
 from torch import Tensor
 
 from learner import dqn, qnet
+from learner.adam import Adam
 from learner.export import to_onnx
-from learner.intake import TrainingError, check, images
+from learner.gradient import Gradient
+from learner.intake import Batch, TrainingError, check, laid_out
 from learner.known import Known
 from learner.qnet import QNet, Shape
 from tmc.kernel.config import Config
 from tmc.kernel.grid import Grid
 from tmc.kernel.observation import Floats
 from tmc.kernel.policy import card_for, view_shape
-from tmc.wire.messages import Minibatch
 
 
 @dataclass(frozen=True)
@@ -66,54 +67,51 @@ class Trainer:
         # update takes 19.4 instead of 25.9 ms (patrol: 8.2 instead of 10.0 ms); either alone gains less.
         self.online = channels_last(qnet.build(config, shape))
         self.target = copy.deepcopy(self.online).requires_grad_(False)
-        self.adam = torch.optim.Adam(self.online.parameters(), lr=config.dqn.learning_rate, fused=True)
-        for p in self.online.parameters():  # as Adam does at its first step, so that `state` is whole before it
-            zeros = {moment: torch.zeros_like(p) for moment in ("exp_avg", "exp_avg_sq")}
-            self.adam.state[p] = {"step": torch.zeros(()), **zeros}
+        self.adam = Adam(self.online.parameters(), config.dqn.learning_rate)
+        self._gradient = Gradient(self.online, config)
         self._known = Known(config.replay.capacity)
 
-    def update(self, minibatch: Minibatch) -> UpdateMetrics:
+    def update(self, batch: Batch) -> UpdateMetrics:
         """One step of Adam on eq. (9), and theta- = theta when that is due. Raises TrainingError."""
-        check(minibatch, self.shape)
-        self._follow(minibatch.episodes)
-        y = self._target(minibatch)
-        action = torch.tensor(minibatch.action, dtype=torch.int64)
-        metrics = self._step(self.online(images(minibatch.observation)), action, y)
+        check(batch, self.shape)
+        self._follow(batch.episodes)
+        y = self._target(batch)
+        action = torch.tensor(batch.action, dtype=torch.int64)
+        gradient, q, loss = self._gradient(laid_out(batch.observation), action, y)
+        metrics = self._step(gradient, q, loss, y)
         every = self.config.dqn.target_updates
         if every and self.updates % every == 0:
             self._copy()
         return metrics
 
     @torch.no_grad()
-    def _target(self, minibatch: Minibatch) -> Tensor:
+    def _target(self, batch: Batch) -> Tensor:
         """y of eq. (8), of scaled rewards: `dqn.target`, with what theta- is known to say of o' looked up."""
-        reward = torch.tensor(minibatch.reward) * self.config.dqn.reward_scale
-        return reward + torch.tensor(minibatch.discount) * torch.from_numpy(self._values(minibatch))
+        reward = torch.tensor(batch.reward) * self.config.dqn.reward_scale
+        return reward + torch.tensor(batch.discount) * torch.from_numpy(self._values(batch))
 
-    def _values(self, minibatch: Minibatch) -> Floats:
+    def _values(self, batch: Batch) -> Floats:
         """max_a' Q(o', a'; theta-) of each transition, computed only where it is not known. Shape (B,)."""
-        values, known = self._known.look_up(minibatch.index)
+        values, known = self._known.look_up(batch.index)
         rest = np.flatnonzero(~known)
         if rest.size:
-            o_next, allowed = images(minibatch.next_observation[rest]), torch.tensor(minibatch.allowed[rest])
+            o_next, allowed = laid_out(batch.next_observation(rest)), torch.tensor(batch.allowed[rest])
             choice = self.online(o_next) if self.config.dqn.double else None
             values[rest] = dqn.value(self.target(o_next), allowed, choice).numpy()
             if choice is None:  # a value that theta has chosen changes with every update
-                self._known.keep(minibatch.index[rest], values[rest])
+                self._known.keep(batch.index[rest], values[rest])
         return values
 
     def forget(self) -> None:
         """The numbers of transitions begin anew: what was known of them is of others."""
         self._known.forget()
 
-    def _step(self, q: Tensor, action: Tensor, y: Tensor) -> UpdateMetrics:
-        """Descend the loss of `q` (B, 9) at `action` (B,) against `y` (B,)."""
-        td = dqn.td_error(q, action, y)
-        loss = dqn.loss(td, self.config.dqn.loss)
-        self.adam.zero_grad()
-        torch.autograd.backward(loss)
-        means = (loss, dqn.of(q, action).mean(), y.mean(), td.abs().mean(), grad_norm(self.online))
-        values = torch.stack([m.detach() for m in means]).tolist()
+    def _step(self, gradient: list[Tensor], q: Tensor, loss: Tensor, y: Tensor) -> UpdateMetrics:
+        """A step of Adam down the gradient of `loss`; `q` (B,) = Q(o, a; theta), `y` (B,)."""
+        for p, g in zip(self.online.parameters(), gradient, strict=True):
+            p.grad = g
+        means = (loss, q.mean(), y.mean(), (q - y).abs().mean(), torch.linalg.vector_norm(flat(gradient)))
+        values = torch.stack(means).tolist()
         if not all(map(math.isfinite, values)):
             raise TrainingError(
                 f"update {self.updates + 1} diverged (loss {values[0]:g}): lower dqn.learning_rate or dqn.reward_scale"
@@ -179,7 +177,7 @@ def copy_due(finished: int, copied: int, f: int) -> bool:
 
 def start(config: Config, grid: Grid) -> Trainer:
     """A trainer on as many threads as the settings say."""
-    torch.set_num_threads(config.training.threads)
+    torch.set_num_threads(1)  # `Gradient` has threads of its own
     return Trainer(config, view_shape(config, grid), grid)
 
 
@@ -191,11 +189,9 @@ def channels_last(net: QNet) -> QNet:
     return net
 
 
-def grad_norm(net: QNet) -> Tensor:
-    """Euclidean norm of the gradient over all weights."""
-    norms = [torch.linalg.vector_norm(p.grad) for p in net.parameters() if p.grad is not None]
-    total: Tensor = torch.linalg.vector_norm(torch.stack(norms))
-    return total
+def flat(gradient: list[Tensor]) -> Tensor:
+    """All of a gradient in one row."""
+    return torch.cat([g.flatten() for g in gradient])
 
 
 def layout(tensors: dict[str, Tensor]) -> dict[str, tuple[int, ...]]:

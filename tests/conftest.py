@@ -1,6 +1,58 @@
-"""For all tests: machines are shared and noisy, so no example of a property has a deadline; pytest's time-out holds."""
+"""For all tests: machines are shared and noisy, so no example of a property has a deadline; pytest's time-out holds.
+And what several tests need and none changes is made once, by the first worker that needs it.
+"""
 
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
+
+from tests.command import overfly
 
 settings.register_profile("overfly", deadline=None)
 settings.load_profile("overfly")
+
+Once = Callable[[str, Callable[[Path], object]], Path]
+TRAINED = ("run", "quick", "--ticks", 60, "--episodes", 2, "--no-pictures",
+           *(word for change in ("replay.learn_start=60", "dqn.batch=16", "journal.flush=0.1", "trial.witness=true")
+             for word in ("--set", change)))  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """The folder of a name, filled by `make(folder)` unless another test or worker has done so: only read it."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def get(name: str, make: Callable[[Path], object]) -> Path:
+        folder, ready = base / name, base / f"{name}.ready"
+        with (base / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not ready.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                ready.touch()
+        return folder
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def trained(once: Once) -> Callable[[int], Path]:
+    """The run folder of a short training of three UAVs in a scenario, with processes: only read it."""
+
+    def train(scenario: int) -> Path:
+        def make(folder: Path) -> None:
+            done = overfly(*TRAINED, "--scenario", scenario, "--out", "R", cwd=folder)
+            assert done.returncode == 0, done.stderr
+
+        return once(f"trained-{scenario}", make) / "R"
+
+    return train

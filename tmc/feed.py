@@ -46,6 +46,6 @@ class Feed:
             s = self.replay.sample(self.limiter.updates, self.batch)
             self.limiter.sample()
             yield Minibatch(
-                self._requests.pop(0), episodes, ticks, s.observation, s.action, s.reward,
-                s.next_observation, s.discount, s.allowed, s.index,
+                self._requests.pop(0), episodes, ticks, s.views.cells, s.views.peers, s.views.u,
+                s.action, s.reward, s.discount, s.allowed, s.index,
             )  # fmt: skip

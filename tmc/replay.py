@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tmc.kernel.draws import Stream, uniforms
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Floats, Ints, Observer
+from tmc.kernel.observation import Floats, Ints, Observer, Views
 from tmc.kernel.world import World
 
 
@@ -28,10 +28,9 @@ class Sample:
     row: Ints
     uav: Ints
     index: Ints
-    observation: Floats
+    views: Views
     action: NDArray[np.uint8]
     reward: Floats
-    next_observation: Floats
     discount: Floats
     allowed: NDArray[np.uint8]
 
@@ -154,12 +153,12 @@ class Replay:
         present = self.cells[end] < self.world.grid.size
         order = np.argsort(~present, axis=1, kind="stable")  # those who were not lost come first
         uav = order[np.arange(batch), (u[batch:] * present.sum(axis=1)).astype(np.int64)]
-        return self.rebuild(self.starts[place].astype(np.int64), end, uav)
+        return self.rebuild(place, uav)
 
-    def rebuild(self, start: Ints, end: Ints, uav: Ints) -> Sample:
-        """Transitions of UAVs `uav` from rows `start` to rows `end`. Shapes (B,)."""
-        B = start.size
-        obs, allowed = self.observe(np.concatenate([start, end]), np.concatenate([uav, uav]))
+    def rebuild(self, place: Ints, uav: Ints) -> Sample:
+        """Transitions of UAVs `uav` at these places among the starts. Shapes (B,)."""
+        B, start, end = place.size, self.starts[place].astype(np.int64), self.ends[place].astype(np.int64)
+        views = self.views(np.concatenate([start, end]), np.concatenate([uav, uav]))
         action = self.actions[start + 1][np.arange(B), uav]
         reward, discount = np.zeros(B), np.ones(B)
         for k in range(1, self.n_step + 1):
@@ -167,39 +166,39 @@ class Replay:
             r = self.rewards[np.minimum(start + k, end)][np.arange(B), uav]
             reward += np.where(live, discount * r, 0.0)
             discount = np.where(live, discount * self.gamma, discount)
-        index = start * self.world.config.team.size + uav
+        index = place * self.world.config.team.size + uav
         return Sample(
-            start, uav, index, obs[:B], action.astype(np.uint8), reward.astype(np.float32),
-            obs[B:], discount.astype(np.float32), allowed[B:],
+            start, uav, index, views, action.astype(np.uint8), reward.astype(np.float32),
+            discount.astype(np.float32), self.allowed(views.rows(slice(B, None))),
         )  # fmt: skip
 
-    def observe(self, row: Ints, uav: Ints) -> tuple[Floats, NDArray[np.uint8]]:
-        """o_i at these rows, exactly as the UAVs saw it, and the actions they would allow. Shapes (B,)."""
-        batch = np.arange(row.size)
+    def views(self, row: Ints, uav: Ints) -> Views:
+        """What o_i at these rows is made of, exactly as the UAVs saw it. Shapes (B,)."""
         team = self._team(row)
-        cells = team[batch, uav]
-        sensed = self.observer.sensed(cells, team, uav)
-        obs = self.observer.observe_batch(cells, team, sensed, self.belief(row, uav))
+        return self.observer.views(team[np.arange(row.size), uav], team, uav, self.belief(row, uav))
+
+    def allowed(self, views: Views) -> NDArray[np.uint8]:
+        """The actions that UAVs who see this would allow. Shape (B, 9)."""
         if not self.world.config.exploration.mask_blocked:
-            return obs, np.ones((row.size, N_ACTIONS), np.uint8)
-        return obs, self.observer.allowed_batch(cells, team, sensed)
+            return np.ones((views.cells.size, N_ACTIONS), np.uint8)
+        return self.observer.allowed_batch(views)
 
     def _team(self, row: Ints) -> Ints:
         """Cells of the team at these rows, (B, N); K for a UAV that was lost."""
         return np.minimum(self.cells[row].astype(np.int64), self.world.grid.size)
 
-    def belief(self, row: Ints, uav: Ints) -> NDArray[np.float64]:
-        """U_i over the monitored cells, shape (B, R), float64."""
+    def belief(self, row: Ints, uav: Ints) -> Floats:
+        """U_i over the monitored cells, shape (B, R), as the observation has it."""
         base = self.base[row][np.arange(row.size), uav].astype(np.int64)
         frame = self.frames[base]
         if self._events:
             bits = np.unpackbits(frame.astype(np.uint8), axis=1, count=self.world.law.cells.size)
-            return bits.astype(np.float64)
+            return bits.astype(np.float32)
         last_visit = self._local_updates(row, uav, frame.astype(np.uint16), self.frame_tick[base].astype(np.int64))
         s = None
         if self.world.config.world.initial_map == "random":
             s = np.stack([self._factors[int(e)] for e in self.episode[row].tolist()])
-        return self.world.law.values(last_visit, self.tick[row].astype(np.int64)[:, None], s)
+        return self.world.law.singles(last_visit, self.tick[row].astype(np.int64)[:, None], s)
 
     def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
         """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers."""

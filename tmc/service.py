@@ -15,7 +15,7 @@ from tmc.roster import LEARNER, uav_name
 from tmc.station import Station
 from tmc.wire import sockets
 from tmc.wire.codec import CodecError, decode
-from tmc.wire.messages import Bye, End
+from tmc.wire.messages import Begin, Bye, End, Map, PolicyPush
 
 BURST = 64
 """Messages taken from one socket before the other has its turn."""
@@ -26,6 +26,10 @@ FAREWELL = 60.0
 """Seconds that the TMC waits for the last client to leave once the mission is over."""
 REUNION = 3.0
 """Seconds that a TMC that was started again waits to hear of clients that do not know yet that the mission is over."""
+
+LEAD = 100
+"""Ticks by which answers are ahead of the journal at most, in a training. So a TMC that was started again knows up to
+which tick its last life may have answered: up to there it names the policy that that one named."""
 
 
 class Service:
@@ -43,6 +47,13 @@ class Service:
             self._expected = {*map(uav_name, range(len(station.roster))), *([LEARNER] if station.learning else [])}
         self._over: float | None = None
         self._taken: Counter[str] = Counter()
+        self._flies: dict[str, int] = {}
+        """The policy that each UAV was last told to fly; all of that is committed."""
+        self._answered = self._committed = 0
+        """Up to when UAVs were answered, and up to when that is committed; see `_when`."""
+        self._free = self._reached() + LEAD if journal.found else 0
+        """Up to when UAVs must have been answered before a newer policy is taken."""
+        self._waiting: PolicyPush | None = None
         self._unsettled: float | None = None
         """When the oldest entry came that is not journalled, seconds of the monotonic clock."""
 
@@ -55,6 +66,7 @@ class Service:
             for sock, _ in poller.poll(self._patience()):
                 self._drain(sock)
             self.station.tick(time.monotonic())
+            self._take_waiting()
             self._send()
             self._settle()
             self.journal.writer.maybe_flush()
@@ -78,14 +90,23 @@ class Service:
             self._unsettled = None
             station.settle()
             self._send()
-            if station.learning:
-                self.journal.keep_policies(station.policies.held())
-            self.journal.take(station.out.take())
+            self._write()
             due = self._commit_due()
-        if due:  # and whatever was accepted is in the journal: a commit acknowledges all of it
-            self.journal.commit()
-            station.committed()
+        if due:
+            self._commit()
             self._send()
+
+    def _write(self) -> None:
+        """Hand over to the journal whatever was accepted."""
+        if self.station.learning:
+            self.journal.keep_policies(self.station.policies.held())
+        self.journal.take(self.station.out.take())
+
+    def _commit(self) -> None:
+        """Commit the journal, in which is whatever was accepted: so all of it is acknowledged."""
+        self.journal.commit()
+        self.station.committed()
+        self._committed = self._answered
 
     def _commit_due(self) -> bool:
         due = self.journal.due
@@ -116,17 +137,65 @@ class Service:
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
-        self.station.answer(sender, message, time.monotonic())
+        if isinstance(message, PolicyPush) and sender == LEARNER:
+            self._waiting = message  # in the place of one that may wait
+            self._take_waiting()
+        else:
+            self.station.answer(sender, message, time.monotonic())
+
+    def _take_waiting(self) -> None:
+        push = self._waiting
+        if push is not None and self._may_change:
+            self._waiting = None
+            self.station.answer(LEARNER, push, time.monotonic())
+
+    @property
+    def _may_change(self) -> bool:
+        """False while exchanges may be repeated that an earlier life has answered: the same policy must be named then.
+
+        True whenever that policy is not at hand, or none will be named any more.
+        """
+        station = self.station
+        over = station.phase in {"learning", "done"}
+        return self._answered >= self._free or over or station.policies.find(station.policies.newest) is None
+
+    def _reached(self) -> int:
+        """When the next exchange is."""
+        flight = self.station.flight
+        if flight is None:
+            return self._when(self.station.episodes + 1, 0)
+        return self._when(flight.episode, flight.next_exchange)
+
+    def _when(self, episode: int, tick: int) -> int:
+        """Ticks since the mission began, each episode's last one counted."""
+        return episode * (self.station.config.training.ticks + 1) + tick
 
     def _send(self) -> None:
-        """Send what the station has for others. The journal can wait: only what is committed is acknowledged."""
+        """Send what the station has for others. The journal can wait, since only what is committed is acknowledged, and
+        `_secure` has seen to the policies."""
         out = self.station.out
         if self._unsettled is None and (out.entries or out.notes):
             self._unsettled = time.monotonic()
-        for name, message in out.take_sends():
+        sends = out.take_sends()
+        self._secure([(name, message) for name, message in sends if isinstance(message, Begin | Map)])
+        for name, message in sends:
             # Who was not heard yet may have been connected to an earlier life of this process.
             sock, identity = self._where.get(name) or (self.feed if name == LEARNER else self.sync, name.encode())
             sockets.send(sock, message, identity)
+
+    def _secure(self, answers: list[tuple[str, Begin | Map]]) -> None:
+        """Commit first what must not be lost once these are sent: that a UAV was told to fly another policy.
+
+        Should the TMC and that UAV be killed, the UAV's next process must be told the same, for peers may have seen
+        where the last one went.
+        """
+        told = {name: answer.policy for name, answer in answers}
+        self._answered = max([self._answered, *(self._when(a.episode, a.tick) for _, a in answers)])
+        ahead = self.station.learning and self._answered > self._committed + LEAD
+        if ahead or any(self._flies.get(name, 0) != policy for name, policy in told.items()):
+            self._write()
+            self._commit()
+        self._flies |= told
 
     def _finished(self) -> bool:
         """Over, and everybody has left or was given time to."""

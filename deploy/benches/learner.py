@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import TYPE_CHECKING
 
 from actors.tracks import create_table
 from deploy import plan, settings
@@ -34,6 +35,9 @@ from tmc.record.reader import Log, decode, run_files
 from tmc.replay import Replay
 from tmc.wire import messages
 from tmc.wire.messages import Minibatch
+
+if TYPE_CHECKING:
+    from learner.intake import Batch
 
 SCALED = {"replay.capacity": 1500, "dqn.target_episodes": 0, "dqn.target_updates": 75}
 MISSION = {**SCALED, "training.episodes": 1_000_000}
@@ -185,16 +189,20 @@ def compare(world: World, steps: int) -> Iterator[Row]:
 
     replay = Replay(world, observation.Observer(world))
     fill(replay)
-    ours, rounding = bare.departures(world.config, _minibatches(replay, steps))
+    ours, rounding = bare.departures(world.config, _batches(replay, steps))
     ratio = ours / rounding if rounding else None
     yield Row("learner", f"{steps:,} steps", ours, "of the gradient", rounding, ratio, "x rounding alone")
 
 
-def _minibatches(replay: Replay, count: int) -> Iterator[Minibatch]:
+def _batches(replay: Replay, count: int) -> Iterator[Batch]:
+    from learner.intake import Intake  # noqa: PLC0415
+
+    intake = Intake(replay.observer)
     for number in range(count):
         if number % 200 == 199:
             say(f"{number + 1:,} of {count:,} steps compared")
         s = replay.sample(number, replay.world.config.dqn.batch)
-        yield Minibatch(
-            number, 0, 0, s.observation, s.action, s.reward, s.next_observation, s.discount, s.allowed, s.index
+        v = s.views
+        yield intake.read(
+            Minibatch(number, 0, 0, v.cells, v.peers, v.u, s.action, s.reward, s.discount, s.allowed, s.index)
         )

@@ -13,7 +13,9 @@ import re
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -41,10 +43,13 @@ POLL = 0.05
 
 @dataclass(frozen=True)
 class Memory:
-    """MiB while flying: private to a UAV's process (the largest), and of all processes, shared pages counted once."""
+    """MiB while flying: private to a UAV's process (the largest), and of all processes, shared pages counted once; the
+    latter by role too, all UAVs together.
+    """
 
     private: float
     total: float
+    roles: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -140,31 +145,39 @@ def fly_fleet(world: World, policy: bytes | None, out: Path) -> Flown:
 
 def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool, weigh: bool) -> Flown:
     """The mission in processes of its own; `weigh`: look at their memory once, half way."""
-    config, file = world.config, None
-    (out / "config.json").write_text(json.dumps(flat(config)))
-    if policy is not None:
-        file = out / "flown.onnx"
-        file.write_bytes(policy)
-    mission = plan.make(config, out, policy=file, table=table)
-    supervisor = Supervisor(mission, out, config.training.threads, _say)
-    observer = Observer(mission.endpoint)
-    memory, half = None, config.training.episodes * config.training.ticks // 2
-    try:
-        if table:
-            create_table(mission.tracks, config.team.size, config.training.ticks)
-        start = time.time_ns()
-        supervisor.start()
+    config, memory, start = world.config, None, time.time_ns()
+    half = config.training.episodes * config.training.ticks // 2
+    with started(config, policy, out, table=table) as (supervisor, observer):
         while not supervisor.watch():
             time.sleep(POLL)
             status = observer.ask()
             if weigh and memory is None and status is not None and status.ticks > half:
                 memory = weigh_all(supervisor.pids())
         supervisor.wait(15.0)
+    return _read(out, config, start, memory)
+
+
+@contextmanager
+def started(
+    config: Config, policy: bytes | None, out: Path, *, table: bool = True
+) -> Iterator[tuple[Supervisor, Observer]]:
+    """The processes of a mission in `out`, and who asks how far they are; they are stopped with the block."""
+    (out / "config.json").write_text(json.dumps(flat(config)))
+    file = None if policy is None else out / "flown.onnx"
+    if file is not None and policy is not None:
+        file.write_bytes(policy)
+    mission = plan.make(config, out, policy=file, table=table)
+    supervisor = Supervisor(mission, out, config.training.threads, _say)
+    observer = Observer(mission.endpoint)
+    try:
+        if table:
+            create_table(mission.tracks, config.team.size, config.training.ticks)
+        supervisor.start()
+        yield supervisor, observer
     finally:
         observer.close()
         supervisor.stop()
         supervisor.close()
-    return _read(out, config, start, memory)
 
 
 def weigh_all(pids: Mapping[str, int]) -> Memory | None:
@@ -177,7 +190,18 @@ def weigh_all(pids: Mapping[str, int]) -> Memory | None:
     if not uavs:
         return None
     private = max(roll["Private_Clean"] + roll["Private_Dirty"] for roll in uavs)
-    return Memory(private / 1024, sum(roll["Pss"] for roll in rolls.values()) / 1024)
+    roles: defaultdict[str, float] = defaultdict(float)
+    for name, roll in rolls.items():
+        roles["uavs" if name.startswith("uav-") else name] += roll["Pss"] / 1024
+    return Memory(private / 1024, sum(roles.values()), dict(roles))
+
+
+def own() -> float | None:
+    """MiB of this process, shared pages in proportion; None where the system does not tell."""
+    try:
+        return _rollup(os.getpid())["Pss"] / 1024
+    except OSError:
+        return None
 
 
 def _rollup(pid: int) -> dict[str, int]:

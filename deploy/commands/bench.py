@@ -24,6 +24,10 @@ BENCHES: tuple[Bench, ...] = (
     Bench("rollout", "deploy.benches.rollout", "UAV steps a second of N processes against the fleet in one process"),
     Bench("journal", "deploy.benches.journal", "what the TMC's journal takes, a commit costs, and a UAV step leaves"),
     Bench("learner", "deploy.benches.learner", "updates a second of a running mission against the bare compute loop"),
+    Bench("startup", "deploy.benches.startup", "seconds to the first update, to a UAV's first word, and of imports"),
+    Bench(
+        "memory", "deploy.benches.memory", "memory of all processes of a training, by role, and of the replay memory"
+    ),
     Bench("train", "deploy.benches.train", "ticks a second of the whole recipe, start and memory, for some team sizes"),
     Bench("replay", "deploy.benches.replay", "bytes a transition, milliseconds a minibatch, inserts a second"),
     Bench("actor", "deploy.benches.actor", "a whole UAV step against the bare call of ONNX Runtime"),

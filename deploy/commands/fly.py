@@ -24,4 +24,4 @@ def main(args: argparse.Namespace) -> int:
     world = mission.check(build(values), pilot.policy)
     out = mission.new_folder(args.out, "fly")
     code = mission.Mission(world, out, mission.command_line(), pilot.policy).run(in_one_process=args.lockstep)
-    return code or report(out, as_json=args.json)
+    return code or report(out, as_json=args.json, pictures=not args.no_pictures)

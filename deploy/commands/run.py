@@ -23,6 +23,7 @@ def add_mission_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder; runs/<name>-<time> when left out")
     parser.add_argument("--lockstep", action="store_true", help="the same mission in one process")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.add_argument("--no-pictures", action="store_true", help="make none (overfly analyze makes them later)")
 
 
 def main(args: argparse.Namespace) -> int:
@@ -35,15 +36,17 @@ def main(args: argparse.Namespace) -> int:
     world = mission.check(config)
     out = mission.new_folder(args.out, args.preset)
     code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
-    return code or report(out, as_json=args.json)
+    return code or report(out, as_json=args.json, pictures=not args.no_pictures)
 
 
 def resume(args: argparse.Namespace) -> int:
     """Go on with a run from its journal and its checkpoint, whatever was killed."""
     if args.preset or args.out or args.lockstep or settings.chosen(args):
-        raise ConfigError("--resume goes on with the run's own settings, as processes: give it nothing but --json")
+        raise ConfigError(
+            "--resume goes on with its own settings, as processes: give it nothing but --json, --no-pictures"
+        )
     if mission.finished(args.resume):
-        return report(args.resume, as_json=args.json)
+        return report(args.resume, as_json=args.json, pictures=not args.no_pictures)
     world, policy = mission.interrupted(args.resume)
     code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)
-    return code or report(args.resume, as_json=args.json)
+    return code or report(args.resume, as_json=args.json, pictures=not args.no_pictures)

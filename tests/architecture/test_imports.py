@@ -30,6 +30,7 @@ HOMES: dict[str, tuple[str, ...]] = {
         "tmc/service.py",
         "tmc/wire/sockets.py",
         "deploy/progress.py",
+        "deploy/benches/startup.py",
         "deploy/commands/doctor.py",
     ),
 }

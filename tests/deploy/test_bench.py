@@ -78,7 +78,7 @@ def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str
     """A small mission in real processes; every value it needs is kept, and the results are the bare loop's."""
     small = ["replay.capacity=200", "dqn.target_updates=10", "dqn.batch=16", "network.channels=4,4"]
     changes = [part for change in small for part in ("--set", change)]
-    turns = ["--repeats", "1", "--seconds", "1", "--threads", "1", "--steps", "40"]
+    turns = ["--repeats", "1", "--seconds", "0.3", "--threads", "1", "--steps", "40"]
     rows = rows_of(capsys, "learner", *turns, "--actors", "2", "--ticks", "200", *changes)
     rate = rows["N=2 threads=1 x bare loop"]
     assert rate["value"] > 0 and rate["ratio"] == pytest.approx(rate["value"] / rate["reference"])
@@ -91,14 +91,42 @@ def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str
 def test_train_counts_the_ticks_of_the_whole_recipe(capsys: pytest.CaptureFixture[str]) -> None:
     small = ["replay.capacity=200", "dqn.target_updates=10", "dqn.batch=16", "network.channels=4,4"]
     changes = [part for change in small for part in ("--set", change)]
-    rows = rows_of(capsys, "train", "--repeats", "1", "--seconds", "1", "--threads", "1", "--actors", "2", *changes)
+    rows = rows_of(capsys, "train", "--repeats", "1", "--seconds", "0.3", "--threads", "1", "--actors", "2", *changes)
     assert rows["N=2 x bare loop"]["value"] > 0
     assert 0 < rows["N=2 start"]["value"] < 60
     assert 50 < rows["N=2 memory"]["value"] < 4096
 
 
+def test_startup_says_how_long_a_user_waits(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = rows_of(capsys, "startup", "--repeats", "1", "--warm", "0", "--actors", "1", "--set", "network.channels=4,4")
+    for case in ("run quick, N=1", "actor alone"):
+        row = rows[f"{case} of what is asked"]
+        assert 0.05 < row["value"] < 120 and row["ratio"] == pytest.approx(row["value"] / row["reference"])
+    parts = [rows[f"{case} x an empty Python"] for case in ("--help", "import actors", "import learner")]
+    assert all(row["value"] > 0 and row["reference"] > 0 for row in parts)
+
+
+def test_memory_is_told_by_role(capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["replay.capacity=300", "dqn.batch=16", "network.channels=4,4", "replay.learn_start=40"]
+    changes = [part for change in small for part in ("--set", change)]
+    rows = rows_of(capsys, "memory", "--transitions", "100", "--actors", "2", "--ticks", "100", *changes)
+    whole = rows["N=2 of what is asked"]
+    assert 50 < whole["value"] < 4096 and whole["ratio"] == pytest.approx(whole["value"] / whole["reference"])
+    roles = {case: row["value"] for case, row in rows.items() if case.endswith("of all")}
+    assert {f"N=2 {role} of all" for role in ("learner", "supervisor", "tmc", "uavs")} <= set(roles)
+    assert sum(roles.values()) == pytest.approx(whole["value"])
+    assert rows["replay, 300 transitions of what is asked"]["value"] < 60
+
+
 @pytest.mark.parametrize(
-    "mistake", [["learner", "--seconds", "0"], ["replay", "--minibatches", "0"], ["actor", "--repeats", "0"]]
+    "mistake",
+    [
+        ["learner", "--seconds", "0"],
+        ["replay", "--minibatches", "0"],
+        ["actor", "--repeats", "0"],
+        ["startup", "--repeats", "0"],
+        ["memory", "--transitions", "100"],
+    ],
 )
 def test_a_number_that_makes_no_sense_is_one_sentence(mistake: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench", *mistake]) == 2
@@ -108,6 +136,8 @@ def test_a_number_that_makes_no_sense_is_one_sentence(mistake: list[str], capsys
 def test_memory_is_what_the_system_says() -> None:
     memory = rollout.weigh_all({"uav-000": os.getpid()})
     assert memory is not None and 1 < memory.private < 4096 and memory.total > 0
+    assert set(memory.roles) == {"uavs", "supervisor"} and sum(memory.roles.values()) == memory.total
+    assert rollout.own() == pytest.approx(memory.roles["supervisor"], rel=0.5)
     assert rollout.weigh_all({"uav-000": 2**22 + 1}) is None
 
 

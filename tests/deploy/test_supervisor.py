@@ -31,7 +31,13 @@ def python(name: str, code: str, *, restart: bool = True, leads: bool = False) -
 def uav(number: int, out: Path) -> Child:
     """A forked UAV that says hello to nobody, for ever."""
     command = ("--id", str(number), "--connect", f"ipc://{out}/nobody", "--out", str(out))
-    return Child(f"uav-{number:03d}", command, restart=True, forked=True)
+    return Child(f"uav-{number:03d}", command, restart=True, fork_of="actors")
+
+
+def learner(out: Path) -> Child:
+    """A forked learner that says hello to nobody, for ever."""
+    command = ("--connect", f"ipc://{out}/nobody", "--out", str(out))
+    return Child("learner", command, restart=True, fork_of="learner")
 
 
 @pytest.fixture
@@ -113,7 +119,8 @@ def test_kills_from_outside_do_not_count(supervise, tmp_path: Path) -> None:
 
 def test_a_forked_uav_fails_like_any_other(supervise, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(supervisors, "TRIES", 2)
-    wrong = Child("uav-000", ("--id", "0", "--connect", "nowhere", "--out", str(tmp_path)), restart=True, forked=True)
+    command = ("--id", "0", "--connect", "nowhere", "--out", str(tmp_path))
+    wrong = Child("uav-000", command, restart=True, fork_of="actors")
     supervisor = supervise(wrong)
     with pytest.raises(MissionFailed, match=r"uav-000 ended with exit code 2: .*nowhere"):
         watch_until(supervisor, lambda: False)
@@ -142,10 +149,23 @@ def test_a_lost_forkserver_is_replaced_and_its_uavs_come_back(supervise, tmp_pat
     supervisor = supervise(uav(0, tmp_path))
     watch_until(supervisor, lambda: "uav-000" in supervisor.pids())
     before = supervisor.pids()
-    os.kill(before["forkserver"], signal.SIGKILL)
+    os.kill(before["forkserver-actors"], signal.SIGKILL)
     watch_until(supervisor, lambda: not alive(before["uav-000"]))
     watch_until(supervisor, lambda: supervisor.pids().get("uav-000", before["uav-000"]) != before["uav-000"])
     assert supervisor.restarts() == {"uav-000": 1}
+
+
+def test_a_killed_learner_is_forked_anew_by_a_process_that_has_no_threads(supervise, tmp_path: Path) -> None:
+    """A fork takes no threads along: a pool that was there before would be gone, and waited for for ever."""
+    supervisor = supervise(learner(tmp_path))
+    watch_until(supervisor, lambda: "learner" in supervisor.pids(), 60.0)
+    before = supervisor.pids()
+    os.kill(before["learner"], signal.SIGKILL)
+    watch_until(supervisor, lambda: supervisor.pids().get("learner", before["learner"]) != before["learner"])
+    after = supervisor.pids()
+    assert after["forkserver-learner"] == before["forkserver-learner"]
+    assert len(list(Path(f"/proc/{after['forkserver-learner']}/task").iterdir())) == 1
+    assert supervisor.restarts() == {"learner": 1}
 
 
 def test_a_forkserver_that_cannot_start_is_a_failure_not_a_kill(tmp_path: Path) -> None:
@@ -155,7 +175,12 @@ def test_a_forkserver_that_cannot_start_is_a_failure_not_a_kill(tmp_path: Path) 
     server.close()
 
 
-def test_everybody_dies_with_a_supervisor_that_is_killed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "package", "options"), [("uav-000", "actors", ("--id", "0")), ("learner", "learner", ())]
+)
+def test_everybody_dies_with_a_supervisor_that_is_killed(
+    tmp_path: Path, name: str, package: str, options: tuple[str, ...]
+) -> None:
     code = f"""
 import sys, time
 from pathlib import Path
@@ -163,10 +188,13 @@ sys.path.insert(0, {str(ROOT)!r})
 from deploy.plan import Child, Plan
 from deploy.supervisor import Supervisor
 out = Path({str(tmp_path)!r})
-child = Child("uav-000", ("--id", "0", "--connect", f"ipc://{{out}}/nobody", "--out", str(out)), True, forked=True)
+command = (*{options}, "--connect", f"ipc://{{out}}/nobody", "--out", str(out))
+child = Child("{name}", command, True, fork_of="{package}")
 supervisor = Supervisor(Plan((child,), "", out / "tracks", out / "scratch"), out, 1, print)
 supervisor.start()
-while "uav-000" not in supervisor.pids():
+until = time.monotonic() + 60
+while "{name}" not in supervisor.pids():
+    assert time.monotonic() < until
     time.sleep(0.01)
 print(*supervisor.pids().values(), flush=True)
 time.sleep(60)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from learner.intake import Batch
 from learner.trainer import Trainer
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import N_ACTIONS, Grid
 from tmc.kernel.policy import view_shape
-from tmc.wire.messages import Minibatch
 
 PATROL: dict[str, Any] = {
     "observation.view": "ego",
@@ -75,18 +75,16 @@ def trainer_of() -> Callable[[Config], Trainer]:
 
 
 @pytest.fixture
-def minibatch_of() -> Callable[..., Minibatch]:
+def minibatch_of() -> Callable[..., Batch]:
     """A minibatch that fits `config`; `number` names it, so that the same number gives the same one."""
 
-    def make(config: Config, number: int = 0, *, b: int = 6, episodes: int = 0, **fields: Any) -> Minibatch:
+    def make(config: Config, number: int = 0, *, b: int = 6, episodes: int = 0, **fields: Any) -> Batch:
         rng = np.random.Generator(np.random.Philox(number))
         images = (b, *view_shape(config, GRID))
         allowed = (rng.random((b, N_ACTIONS)) < 0.6).astype("u1")
         allowed[:, -1] = 1
         values: dict[str, Any] = {
-            "request": number,
             "episodes": episodes,
-            "ticks": 0,
             "observation": rng.random(images).astype("<f4"),
             "action": rng.integers(0, N_ACTIONS, b).astype("u1"),
             "reward": rng.normal(0, 5, b).astype("<f4"),
@@ -95,6 +93,8 @@ def minibatch_of() -> Callable[..., Minibatch]:
             "allowed": allowed,
             "index": np.arange(b, dtype="<i8") + 2**20 * number,
         }
-        return Minibatch(**{**values, **fields})
+        values |= fields
+        following = values.pop("next_observation")
+        return Batch(**values, next_observation=lambda rows: following[rows])
 
     return make

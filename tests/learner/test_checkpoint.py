@@ -26,6 +26,10 @@ def equal(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
+def go_on(path, trainer):
+    checkpoint.load(checkpoint.read(path), trainer)
+
+
 @pytest.fixture
 def trained(small, trainer_of, minibatch_of):
     """A trainer that has made some updates."""
@@ -46,7 +50,7 @@ def test_resuming_gives_the_same_weights_bit_for_bit(tmp_path, preset, trainer_o
         straight.update(minibatch_of(config, n, episodes=n))
     for n in range(4):
         first.update(minibatch_of(config, n, episodes=n))
-    checkpoint.load(checkpoint.save(tmp_path, first), second)
+    go_on(checkpoint.save(tmp_path, first), second)
     for n in range(4, 8):
         second.update(minibatch_of(config, n, episodes=n))
     assert equal(tensors(straight), tensors(second))
@@ -56,7 +60,7 @@ def test_resuming_gives_the_same_weights_bit_for_bit(tmp_path, preset, trainer_o
 def test_counters_and_versions_come_back(tmp_path, trained):
     trainer, other = trained(3), trained(0)
     trainer.policy(after=11)
-    checkpoint.load(checkpoint.save(tmp_path, trainer), other)
+    go_on(checkpoint.save(tmp_path, trainer), other)
     assert (other.updates, other.version) == (3, 12)
     assert other.policy()[0] == 13
 
@@ -95,7 +99,7 @@ def test_foreign_files_are_left_alone(tmp_path, trained):
     for name in ("checkpoint-best.safetensors", "notes.txt", "checkpoint--1.safetensors"):
         (tmp_path / name).write_text("mine")
     path = checkpoint.save(tmp_path, trained(1))
-    assert checkpoint.newest(tmp_path) == path
+    assert checkpoint.newest(tmp_path).name == path.name
     assert len(names(tmp_path)) == 4
 
 
@@ -113,7 +117,7 @@ def test_a_writer_killed_in_between_leaves_the_older_checkpoint(tmp_path, traine
         with pytest.raises(Killed):
             checkpoint.save(tmp_path, trained(3))
     assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-3.safetensors.part"]
-    assert checkpoint.newest(tmp_path) == old
+    assert checkpoint.newest(tmp_path).name == old.name
     checkpoint.save(tmp_path, trained(4))
     assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-4.safetensors"]
 
@@ -132,10 +136,10 @@ def test_a_truncated_checkpoint_is_skipped_with_a_sentence(tmp_path, trained, ca
     old, new = checkpoint.save(tmp_path, trained(2)), checkpoint.save(tmp_path, trained(3))
     new.write_bytes(new.read_bytes()[:left])
     with caplog.at_level(logging.WARNING):
-        assert checkpoint.newest(tmp_path) == old
+        assert checkpoint.newest(tmp_path).name == old.name
     assert "checkpoint-3.safetensors is damaged or cut short: delete it" in caplog.text
     with pytest.raises(CheckpointError, match="damaged"):
-        checkpoint.load(new, trained(0))
+        go_on(new, trained(0))
 
 
 def test_a_flipped_bit_anywhere_is_found(tmp_path, trained):
@@ -156,7 +160,7 @@ def test_a_folder_in_the_place_of_a_checkpoint_is_skipped(tmp_path, trained):
 
 def test_a_missing_file_is_named(tmp_path, trained):
     with pytest.raises(CheckpointError, match="there is no checkpoint"):
-        checkpoint.load(tmp_path / "checkpoint-1.safetensors", trained(0))
+        go_on(tmp_path / "checkpoint-1.safetensors", trained(0))
 
 
 @pytest.mark.parametrize(
@@ -172,16 +176,16 @@ def test_a_checkpoint_of_another_network_is_refused_and_changes_nothing(tmp_path
     path, other = checkpoint.save(tmp_path, trained(2)), trained(1, **values)
     before = tensors(other)
     with pytest.raises(CheckpointError, match=f"{text}: choose the settings it was made with"):
-        checkpoint.load(path, other)
+        go_on(path, other)
     assert equal(before, tensors(other))
     assert other.updates == 1
 
 
 def test_settings_that_do_not_shape_the_network_may_change(tmp_path, trained):
     path, other = checkpoint.save(tmp_path, trained(2)), trained(0, **{"dqn.learning_rate": 1e-4})
-    checkpoint.load(path, other)
+    go_on(path, other)
     assert other.updates == 2
-    assert other.adam.param_groups[0]["lr"] == 1e-4
+    assert other.adam.lr == 1e-4
 
 
 def test_a_foreign_format_is_named(tmp_path, trained):

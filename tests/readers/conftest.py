@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -33,19 +31,9 @@ class Topic:
 
 
 @pytest.fixture(scope="session")
-def missions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def missions(once: Callable[[str, Callable[[Path], object]], Path], trained: Callable[[int], Path]) -> Path:
     """The folder with all missions: flown once, by the first worker that needs them."""
-    base = tmp_path_factory.getbasetemp()
-    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    folder, ready = base / "readers", base / "readers.ready"
-    with (base / "readers.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not ready.exists():
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            make(folder)
-            ready.touch()
-    return folder
+    return once("readers", lambda folder: make(folder, trained(1)))
 
 
 FOLDERS = {

@@ -6,39 +6,40 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from tests.command import LINE, here, overfly
 from tmc.kernel.config import Journal
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.reader import info
 from tmc.record.writer import LogWriter
 
-SMALL = ("--set", "replay.learn_start=60", "--set", "dqn.batch=16", "--set", "journal.flush=0.1")
-TRAINED = ("run", "quick", "--scenario", "1", "--ticks", "60", "--episodes", "2", "--set", "trial.witness=true", *SMALL)
-FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60")
+FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures")
 # Slow enough to be still in flight when all have written.
-KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", *SMALL)
-LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--set", "trial.stall=0.03",
+KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", "--set", "replay.learn_start=60",
+          "--set", "dqn.batch=16", "--set", "journal.flush=0.1")  # fmt: skip
+LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures", "--set", "trial.stall=0.03",
           "--set", "comms.patience=0.5", "--set", "comms.lost_after=1", "--set", "journal.flush=0.1")  # fmt: skip
+CHUNK = 0x06
+"""The opcode of a chunk of messages."""
 WRITERS = ("tmc", "learner", "uav-000", "uav-001")
-_COMMAND = (sys.executable, "-P", "-m", "deploy.cli")
 
 
-def make(folder: Path) -> None:
-    """Fly the missions: finished logs are `*/*.mcap`; `killed` and `cut` hold `*.mcap.active` as a kill leaves them."""
-    for name, mission in (("trained", TRAINED), ("flown", FLOWN)):
-        done = overfly(*mission, "--out", folder / name)
-        assert done.returncode == 0, done.stderr
+def make(folder: Path, trained: Path) -> None:
+    """Fly the rest: finished logs are `*/*.mcap`; `killed` and `cut` have `*.mcap.active`, as a kill leaves them."""
+    shutil.copytree(trained, folder / "trained")
+    done = overfly(*FLOWN, "--out", folder / "flown", cwd=folder)
+    assert done.returncode == 0, done.stderr
     lose_one(folder / "losing")
     for view in ("merge", "replay"):
-        done = overfly("log", view, folder / "flown", "--out", folder / "made" / f"{view}.mcap")
+        done = here("log", view, folder / "flown", "--out", folder / "made" / f"{view}.mcap", cwd=folder)
         assert done.returncode == 0, done.stderr
     shutil.copytree(folder / "trained", folder / "sealed")
-    done = overfly("log", "seal", folder / "sealed")
+    done = here("log", "seal", folder / "sealed", cwd=folder)
     assert done.returncode == 0, done.stderr
     kill_in_flight(folder / "killed")
     cut(folder / "killed" / f"tmc.mcap{ACTIVE}", folder / "cut")
@@ -47,15 +48,26 @@ def make(folder: Path) -> None:
         recover(left, folder / f"recovered-{left.name}")
 
 
-def overfly(*args: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*_COMMAND, *map(str, args)], capture_output=True, text=True, timeout=120, check=False)
-
-
 def cut(log: Path, folder: Path) -> None:
-    """A copy of the log as if the kill had torn what was being written."""
+    """A copy of the log as if the kill had torn the chunk that was being written.
+
+    In the chunk itself: of one that is whole but not yet indexed, each reader makes what it likes.
+    """
     folder.mkdir()
     whole = log.read_bytes()
-    (folder / log.name).write_bytes(whole[: len(whole) * 3 // 4])
+    chunks = [(start, length) for kind, start, length in _records(whole) if kind == CHUNK]
+    start, length = next((chunk for chunk in chunks if sum(chunk) > len(whole) * 3 // 4), chunks[-1])
+    (folder / log.name).write_bytes(whole[: start + length // 2])
+
+
+def _records(log: bytes) -> Iterator[tuple[int, int, int]]:
+    """(opcode, where its content starts, length) of each whole record: behind the magic, an opcode and a u64."""
+    at = 8
+    while at + 9 <= len(log):
+        length = int.from_bytes(log[at + 1 : at + 9], "little")
+        if at + 9 + length <= len(log):
+            yield log[at], at + 9, length
+        at += 9 + length
 
 
 def resume(left: Path, folder: Path) -> None:
@@ -68,7 +80,7 @@ def resume(left: Path, folder: Path) -> None:
 def recover(left: Path, folder: Path) -> None:
     """Recover logs as a user does; exit code 3 says that something is lost."""
     _copies(left, folder)
-    done = overfly("log", "recover", folder, "--in-place")
+    done = here("log", "recover", folder, "--in-place", cwd=folder)
     assert done.returncode in (0, 3), done.stderr
 
 
@@ -79,7 +91,7 @@ def _copies(left: Path, folder: Path) -> list[Path]:
 
 def lose_one(out: Path) -> None:
     """A flight in which one of two UAVs falls silent for so long that the other goes on without it."""
-    with subprocess.Popen([*_COMMAND, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
+    with subprocess.Popen([*LINE, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
         _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
         (silent,) = (
             p for p in _descendants(run.pid) if b"--id\0001\0" in (Path("/proc") / str(p) / "cmdline").read_bytes()
@@ -92,7 +104,7 @@ def lose_one(out: Path) -> None:
 
 def kill_in_flight(out: Path) -> None:
     """SIGKILL supervisor, TMC, learner and UAVs once each of them has a message in its log."""
-    with subprocess.Popen([*_COMMAND, *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
+    with subprocess.Popen([*LINE, *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
         try:
             _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in WRITERS])
             time.sleep(0.5)

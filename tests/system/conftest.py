@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from tests import command
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -16,12 +17,13 @@ Overfly = Callable[..., subprocess.CompletedProcess[str]]
 @pytest.fixture
 def overfly(tmp_path: Path) -> Overfly:
     """Run `overfly ARGS` in an empty folder; nothing is asserted here."""
+    return lambda *args, **timeout: command.overfly(*args, cwd=tmp_path, **timeout)
 
-    def run(*args: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-P", "-m", "deploy.cli", *map(str, args)]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=timeout, check=False)
 
-    return run
+@pytest.fixture
+def here(tmp_path: Path) -> Overfly:
+    """The same in this process, for what starts no process."""
+    return lambda *args: command.here(*args, cwd=tmp_path)
 
 
 def processes_of(marker: str) -> list[int]:

@@ -13,14 +13,14 @@ from pathlib import Path
 from tmc.record.reader import Log
 
 
-def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(overfly, running, tmp_path: Path) -> None:
+def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(here, running, tmp_path: Path) -> None:
     out = tmp_path / "R"
     command = [sys.executable, "-P", "-m", "deploy.cli", "fly", "planner:greedy", "--actors", "3", "--ticks", "20000"]
     with subprocess.Popen([*command, "--out", str(out)], cwd=tmp_path, stderr=subprocess.DEVNULL) as run:
         until = time.monotonic() + 60
         while time.monotonic() < until and not flying(out / "tmc.mcap.active"):
             time.sleep(0.1)
-        refused = overfly("log", "seal", out)
+        refused = here("log", "seal", out)
         assert refused.returncode == 1 and "is being written by another process" in refused.stderr
         assert run.poll() is None, "the mission was over before it could be killed"
         for pid in [run.pid, *running(str(out))]:
@@ -30,21 +30,21 @@ def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(overfly, runn
         time.sleep(0.05)
     logs = {path.name: held(path) for path in out.glob("*.active")}
     assert set(logs) == {"tmc.mcap.active", *(f"uav-00{i}.mcap.active" for i in range(3))}
-    checked = overfly("log", "check", out)
+    checked = here("log", "check", out)
     assert checked.returncode == 0, checked.stdout + checked.stderr
     assert "1 episode (1 not finished)" in checked.stdout and "the file was not closed" in checked.stdout
-    digest = overfly("log", "digest", out).stdout
-    assert overfly("log", "recover", out).returncode in (0, 3)
+    digest = here("log", "digest", out).stdout
+    assert here("log", "recover", out).returncode in (0, 3)
     for name, messages in logs.items():
         log = Log(out / name.replace(".mcap.active", ".recovered.mcap"))
         assert log.finished and sum(1 for _ in log.raw()) == messages
         log.path.unlink()
-    sealed = overfly("log", "seal", out)
+    sealed = here("log", "seal", out)
     assert sealed.returncode in (0, 3), sealed.stderr
     assert not list(out.glob("*.active"))
     assert {f"{p.name}.active": held(p) for p in out.glob("*.mcap")} == logs
-    assert overfly("log", "check", out).returncode == 0
-    assert overfly("log", "digest", out).stdout == digest
+    assert here("log", "check", out).returncode == 0
+    assert here("log", "digest", out).stdout == digest
 
 
 def held(path: Path) -> int:

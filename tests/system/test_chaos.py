@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
-SHORT = ("--actors", "3", "--ticks", "400", "--episodes", "2", "--json")
+SHORT = ("--actors", "3", "--ticks", "400", "--json")
 LIGHT = ("--actors", "2", "--ticks", "200", "--set", "dqn.batch=8", "--set", "replay.learn_start=16", "--json")
 
 
@@ -26,16 +26,18 @@ def storm(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kills", "options"), [(8, ()), (3, ("--scenario", "1")), (3, ("--set", "comms.phase=staggered"))], ids=str
+    ("kills", "episodes", "options"),
+    [(8, 4, ()), (3, 2, ("--scenario", "1")), (3, 2, ("--set", "comms.phase=staggered"))],
+    ids=str,
 )
 def test_missions_that_are_disturbed_fly_what_lock_step_flies(
-    overfly: Overfly, tmp_path: Path, kills: int, options: tuple[str, ...]
+    overfly: Overfly, tmp_path: Path, kills: int, episodes: int, options: tuple[str, ...]
 ) -> None:
-    row = storm(overfly, "--mode", "fly", "--kills", str(kills), *SHORT, *options)
+    row = storm(overfly, "--mode", "fly", "--kills", str(kills), "--episodes", str(episodes), *SHORT, *options)
     assert row["faults"] == [] and row["folder"] == ""
     assert sum(row["kills"].values()) == kills and row["back"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
-    assert row["episodes"] == 2 * row["missions"] and row["ticks"] == 400 * row["episodes"]
+    assert row["episodes"] == episodes * row["missions"] and row["ticks"] == 400 * row["episodes"]
     assert not any(tmp_path.iterdir())
 
 
@@ -48,7 +50,7 @@ def test_a_training_that_is_disturbed_goes_on(overfly: Overfly) -> None:
 
 @pytest.mark.slow
 def test_power_cuts_take_nothing_that_was_acknowledged(overfly: Overfly) -> None:
-    row = storm(overfly, "--mode", "fly", "--power", "--kills", "5", "--storm", "2", *SHORT)
+    row = storm(overfly, "--mode", "fly", "--power", "--kills", "5", "--storm", "2", "--episodes", "4", *SHORT)
     assert row["faults"] == [] and row["kills"]["power"] >= 1 and row["back"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
 
@@ -56,8 +58,19 @@ def test_power_cuts_take_nothing_that_was_acknowledged(overfly: Overfly) -> None
 @pytest.mark.slow
 def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly, tmp_path: Path) -> None:
     """The counter-check: a journal that only survives the end of its process."""
-    options = ("--power", "--set", "journal.durability=process", "--kills", "4", "--storm", "2", *SHORT)
-    row = storm(overfly, "--mode", "fly", *options, "--keep", str(tmp_path / "kept"), code=1)
+    options = (
+        "--mode",
+        "fly",
+        "--power",
+        "--set",
+        "journal.durability=process",
+        "--kills",
+        "4",
+        "--storm",
+        "2",
+        *SHORT,
+    )
+    row = storm(overfly, *options, "--episodes", "2", "--keep", str(tmp_path / "kept"), code=1)
     assert row["lost"] > 0 and row["bytes_cut"] > 0
 
 
@@ -65,6 +78,6 @@ def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly
 def test_losses_are_seen_when_there_are_some(overfly: Overfly, tmp_path: Path) -> None:
     """The counter-check. What was kept shows it too: the last commit is older than what was acknowledged."""
     options = ("--mode", "fly", "--ack-early", "--kills", "12", "--set", "journal.commit=0.2", *SHORT)
-    row = storm(overfly, *options, "--keep", str(tmp_path / "kept"), code=1)
+    row = storm(overfly, *options, "--episodes", "2", "--keep", str(tmp_path / "kept"), code=1)
     assert row["lost"] > 0 and any("were acknowledged and are lost" in fault for fault in row["faults"])
     assert row["folder"] == str(tmp_path / "kept") and "did not survive" in (tmp_path / "kept/diary.txt").read_text()

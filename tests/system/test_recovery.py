@@ -8,7 +8,6 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import main
+from tests.command import LINE
 from tmc.analysis.check import check
 from tmc.journal import journal_in
 from tmc.kernel.config import Journal
@@ -25,7 +25,7 @@ from tmc.record.writer import LogWriter
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 Running = Callable[[str], list[int]]
-FLIGHT = ("fly", "planner:greedy", "--actors", "3", "--ticks", "500", "--seed", "7")
+FLIGHT = ("fly", "planner:greedy", "--actors", "3", "--ticks", "500", "--seed", "7", "--no-pictures")
 SLOW = ("--set", "trial.stall=0.005", "--set", "trial.stall_share=1.0")
 """Every UAV stalls a little, so that the mission lasts long enough to be killed in."""
 
@@ -39,7 +39,7 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def begin(tmp_path: Path, *command: str) -> subprocess.Popen[str]:
-    line = [sys.executable, "-P", "-m", "deploy.cli", *command]
+    line = [*LINE, *command]
     return subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
 
 
@@ -97,26 +97,26 @@ def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, calm
 
 
 def test_a_flight_goes_on_after_everything_was_killed(
-    overfly: Overfly, running: Running, calm: str, tmp_path: Path
+    overfly: Overfly, here: Overfly, running: Running, calm: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "R"
     with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
         wait_for(lambda: records(out) > 40, run)
-        busy = overfly("run", "--resume", out)
+        busy = here("run", "--resume", out)
         assert busy.returncode == 2 and "is being written by another process: end that one first" in busy.stderr
         kill_all(run, running, out)
     assert 40 < records(out) < 3 * 51 and not (out / "tmc.mcap").exists()
-    again = overfly("run", "--resume", out)
+    again = overfly("run", "--resume", out, "--no-pictures")
     assert again.returncode == 0, again.stderr
     assert "Uncertainty" in again.stdout
     assert digest(out) == calm and check(out).good
     told = json.loads((out / "run.json").read_text())
     assert set(told["exit_codes"].values()) == {0} and told["sealed"]["after"] > 0
     # Finished now: nothing is flown again, and the summary is said.
-    size, start = (out / "tmc.mcap").stat(), time.monotonic()
-    done = overfly("run", "--resume", out, "--json")
+    size = (out / "tmc.mcap").stat()
+    done = here("run", "--resume", out, "--json", "--no-pictures")
     assert done.returncode == 0 and json.loads(done.stdout)
-    assert time.monotonic() - start < 15 and (out / "tmc.mcap").stat() == size
+    assert (out / "tmc.mcap").stat() == size
 
 
 def test_training_goes_on_after_everything_was_killed(overfly: Overfly, running: Running, tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_training_goes_on_after_everything_was_killed(overfly: Overfly, running:
         wait_for(lambda: ended(out) >= 1 and list((out / "checkpoints").glob("*.safetensors")), run)
         kill_all(run, running, out)
     before = ended(out)
-    again = overfly("run", "--resume", out)
+    again = overfly("run", "--resume", out, "--no-pictures")
     assert again.returncode == 0, again.stderr
     assert 1 <= before <= ended(out) == 4
     entries = [e.message for e in Log(out / "tmc.mcap").entries(["/tmc/episode"])]
@@ -150,7 +150,7 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
         (("run", "--resume", strange), "config.json cannot be read"),
         (
             ("run", "quick", "--resume", strange),
-            "with the run's own settings, as processes: give it nothing but --json",
+            "with its own settings, as processes: give it nothing but --json, --no-pictures",
         ),
         (("run", "--resume", strange, "--ticks", 5), "give it nothing but --json"),
         (("tmc", "--resume", strange, "--ticks", 5), "give it nothing but --bind"),

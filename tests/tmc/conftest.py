@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from actors.airspace import Waiting
 from actors.pilot import LostRecordsError, Phase, Pilot
@@ -18,7 +19,7 @@ from actors.tracks import TableTracks, TrackTable
 from tmc.entries import Entry
 from tmc.kernel.config import build
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import Floats, Ints, Observer
 from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
 from tmc.kernel.world import World
 from tmc.roster import uav_name
@@ -296,10 +297,16 @@ class Mission:
         """The replay's number of a tick."""
         return (episode - 1) * (self.T + 1) + tick
 
+    def rebuilt(self, rows: Ints, uavs: Ints) -> tuple[Floats, NDArray[np.uint8]]:
+        """Images of o_i at these rows, and the actions allowed there, as the replay has them."""
+        replay = self.station.replay
+        views = replay.views(rows, uavs)
+        return replay.observer.observe_batch(views), replay.allowed(views)
+
     def differences(self, keys: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
         """Of these (episode, tick, uav), those that the replay rebuilds otherwise than the UAV saw them."""
         rows = np.array([self.row(e, t) for e, t, _ in keys])
-        o, allowed = self.station.replay.observe(rows, np.array([i for _, _, i in keys]))
+        o, allowed = self.rebuilt(rows, np.array([i for _, _, i in keys]))
         wrong = []
         for k, key in enumerate(keys):
             saw, could = self.seen[key]

@@ -35,7 +35,7 @@ def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., 
     (minibatch,) = feed.serve(1, 20)
     assert (minibatch.request, minibatch.episodes, minibatch.ticks) == (2, 1, 20)
     s = feed.replay.sample(0, 4)
-    assert np.array_equal(minibatch.index, s.row * 3 + s.uav)
+    assert np.array_equal(minibatch.index, s.index) and np.array_equal(minibatch.u, s.views.u)
 
 
 def test_only_so_many_requests_are_taken(mission: Callable[..., Any], town: RoadMap) -> None:

@@ -145,8 +145,9 @@ def test_what_is_learned_from_is_what_was_seen(losing: Callable[[int], Losing], 
     sample = replay.sample(3, 4000)
     assert (replay.cells[sample.row][np.arange(4000), sample.uav] != GONE).all()
     episodes, ticks = replay.episode[sample.row].tolist(), replay.tick[sample.row].tolist()
+    images = replay.observer.observe_batch(sample.views)
     for b, key in enumerate(zip(episodes, ticks, sample.uav.tolist(), strict=True)):
-        assert (sample.observation[b] == mission.seen[key]).all(), key
+        assert (images[b] == mission.seen[key]).all(), key
     assert {e for e, t, i in zip(episodes, ticks, sample.uav, strict=True) if i == LOST} >= {1, 3}
 
 

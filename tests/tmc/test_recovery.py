@@ -334,7 +334,7 @@ def test_of_old_episodes_only_the_sums_are_taken(
     assert [(u.life, u.sequence, u.past) for u in quick.roster] == [(u.life, u.sequence, u.past) for u in whole.roster]
     assert quick.limiter == whole.limiter
     first, second = whole.replay.sample(5, 64), quick.replay.sample(5, 64)
-    assert first.observation.tobytes() == second.observation.tobytes()
+    assert first.views.u.tobytes() == second.views.u.tobytes()
     assert first.reward.tobytes() == second.reward.tobytes()
 
 

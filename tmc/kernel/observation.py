@@ -6,6 +6,8 @@ view is the whole grid, or the square of `2 radius + 1` cells around the UAV.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,23 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class Views:
+    """What B observations are made of: what is sent instead of images, a ninth of their size with the paper's map.
+
+    `cells` (B,) uint16: where the UAV stands. `peers` (B, P) uint16: cells of the sensed UAVs; K where there are fewer.
+    `u` (B, R) float32: the UAV's own map, over the monitored cells.
+    """
+
+    cells: NDArray[np.uint16]
+    peers: NDArray[np.uint16]
+    u: Floats
+
+    def rows(self, which: slice | NDArray[np.int64]) -> Views:
+        """Some of them."""
+        return Views(self.cells[which], self.peers[which], self.u[which])
+
+
 class Observer:
     """Builds observations of one world; holds tables, no state."""
 
@@ -30,6 +49,8 @@ class Observer:
         """r_s in cell widths; everyone knows all positions in scenario I (Sec. II-C)."""
         self._whole = config.observation.view == "whole"
         K, R = grid.size, world.law.cells.size
+        self.R = R
+        """The number of monitored cells."""
         window = np.arange(K)[None, :] if self._whole else grid.window(config.observation.radius)
         self._window = window.astype(np.int64)
         terrain = np.where(world.map.blocked, -1.0, np.where(world.map.road, 1.0, 0.0))
@@ -88,12 +109,23 @@ class Observer:
         near[np.arange(len(uav)), uav] = False
         return near
 
-    def observe_batch(self, cells: Ints, team: Ints, sensed: NDArray[np.bool_], u: NDArray[np.float64]) -> Floats:
-        """Observations of a batch: (B,), (B, N), (B, N), (B, R) -> (B, C, H, W), the same bits as `observe`."""
-        B = cells.size
-        out = np.zeros((B, 3, self._window.shape[1]), np.float32)
-        batch, peer = np.nonzero(sensed)
-        self._mark_batch(out, batch, cells[batch], team[batch, peer], PEER)
+    def views(self, cells: Ints, team: Ints, uav: Ints, u: Floats) -> Views:
+        """What UAVs `uav` see: shapes (B,), (B, N), (B,), (B, R)."""
+        peers = np.sort(np.where(self.sensed(cells, team, uav), team, self.grid.size), axis=1)
+        most = int((peers < self.grid.size).sum(axis=1).max(initial=0))
+        return Views(cells.astype("<u2"), peers[:, :most].astype("<u2"), u)
+
+    def observe_batch(self, views: Views, images: Floats | None = None) -> Floats:
+        """Observations of a batch, (B, C, H, W), the same bits as `observe`; drawn into `images` when given.
+
+        `images` may lie in memory as it likes: channels last, for one.
+        """
+        B, cells, u = views.cells.size, views.cells.astype(np.int64), views.u
+        drawn = np.empty((B, *self.shape), np.float32) if images is None else images
+        drawn[...] = 0.0
+        out = drawn.reshape(B, 3, -1)
+        batch, peer = np.nonzero(views.peers < self.grid.size)
+        self._mark_batch(out, batch, cells[batch], views.peers[batch, peer].astype(np.int64), PEER)
         self._mark_batch(out, np.arange(B), cells, cells, EGO)
         if self._whole:  # only the monitored cells are written: a gather of all of them takes three times as long
             out[:, 1] = self._terrain[0]
@@ -103,7 +135,7 @@ class Observer:
             padded[:, :-1] = u
             out[:, 1] = self._terrain[cells]
             out[:, 2] = padded.ravel().take(self._place[cells] + np.arange(0, padded.size, padded.shape[1])[:, None])
-        return out.reshape(B, *self.shape)
+        return drawn
 
     def _mark_batch(self, out: Floats, batch: Ints, cells: Ints, where: Ints, value: float) -> None:
         """As `_mark`, for images `batch` of UAVs on `cells`; shapes (n,)."""
@@ -116,12 +148,11 @@ class Observer:
         seen = (y >= 0) & (y < side) & (x >= 0) & (x < side)
         out[batch[seen], 0, (y * side + x)[seen]] = value
 
-    def allowed_batch(self, cells: Ints, team: Ints, sensed: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def allowed_batch(self, views: Views) -> NDArray[np.uint8]:
         """Shape (B, 9): 1 for the actions that `allowed` lists."""
-        targets = self.grid.targets[cells]
-        peers = np.where(sensed, team, -2)
-        held = (targets[:, :, None] == peers[:, None, :]).any(axis=2)
-        return np.asarray(self.free[cells] & ~held, np.uint8)
+        targets = self.grid.targets[views.cells]
+        held = (targets[:, :, None] == views.peers[:, None, :]).any(axis=2)
+        return np.asarray(self.free[views.cells] & ~held, np.uint8)
 
 
 class Canvas:

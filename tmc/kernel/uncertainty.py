@@ -35,6 +35,8 @@ class UncertaintyLaw:
         self._decay = np.exp(-rates[:, None] * np.arange(ticks + 1)[None, :]).ravel()
         self._offset = rate_of.astype(np.int64) * (ticks + 1)
         self._offsets: list[int] = self._offset.tolist()
+        self._single = (1.0 - self._decay).astype(np.float32)
+        self._rows = np.int32(0) if rates.size < 2 else self._offset.astype(np.int32)
 
     def values(
         self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64], s: NDArray[np.float64] | None = None
@@ -47,6 +49,15 @@ class UncertaintyLaw:
         if s is not None:
             left = np.where(last_visit == 0, s * left, left)
         return np.asarray(1.0 - left)
+
+    def singles(
+        self, last_visit: NDArray[np.uint16], t: NDArray[np.int64], s: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float32]:
+        """`values` rounded to float32, in a tenth of the time where there is no `s`."""
+        if s is not None:
+            return self.values(last_visit, t, s).astype(np.float32)
+        age = np.subtract(t.astype(np.uint16), last_visit, dtype=np.uint16)
+        return self._single.take(age if self._rows.ndim == 0 else age + self._rows)
 
     def value(self, i: int, last_visit: int, t: int, s: NDArray[np.float64] | None = None) -> float:
         """u of the one cell `cells[i]`; the same bits as `values`."""

@@ -129,10 +129,7 @@ def _frame(rest: Any, name: str, shape: Any, rule: fields.Rule) -> Any:
         count *= n
     if count * dtype.itemsize != memoryview(data).nbytes:
         raise CodecError("malformed", f"the frame of {name} does not have the size of its shape")
-    try:
-        return np.frombuffer(data, dtype).reshape(shape)
-    except ValueError:  # a side of 0 among sides whose product NumPy cannot hold
-        raise CodecError("malformed", f"the shape of {name} is impossible") from None
+    return np.frombuffer(data, dtype).reshape(shape)
 
 
 def _array(raw: Any, name: str, rule: fields.Rule) -> Any:

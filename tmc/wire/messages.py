@@ -163,20 +163,22 @@ class SampleRequest(Message):
 
 @dataclass(frozen=True)
 class Minibatch(Message):
-    """`b` transitions (o_t, a_t, o_{t+n}, r) with their observations rebuilt.
+    """`b` transitions (o_t, a_t, o_{t+n}, r), with what their observations are drawn from.
 
-    `observation`, `next_observation`: (b, C, H, W) float32. `reward`: the n-step sum, unscaled. `discount`: gamma^n.
-    `allowed`: (b, 9), 0 for the actions that a UAV in o_{t+n} would not choose. `episodes`: finished so far.
-    `index`: a number of each transition, which no other has before the TMC's next `Welcome`.
+    `cells` (2b,), `peers` (2b, P), `u` (2b, R): the fields of `tmc.kernel.observation.Views`, first those of o_t, then
+    those of o_{t+n}. `reward`: the n-step sum, unscaled. `discount`: gamma^n. `allowed`: (b, 9), 0 for the actions that
+    a UAV in o_{t+n} would not choose. `episodes`: finished so far. `index`: a number of each transition, which no
+    other has before the TMC's next `Welcome`.
     """
 
     request: int = f.integer(0, 2**62)
     episodes: int = f.integer(0, 2**31 - 1)
     ticks: int = f.integer(0, 2**62)
-    observation: Array = f.tensor("<f4", 4)
+    cells: Array = f.tensor("<u2", 1)
+    peers: Array = f.tensor("<u2", 2)
+    u: Array = f.tensor("<f4", 2)
     action: Array = f.tensor("u1", 1)
     reward: Array = f.tensor("<f4", 1)
-    next_observation: Array = f.tensor("<f4", 4)
     discount: Array = f.tensor("<f4", 1)
     allowed: Array = f.tensor("u1", 2)
     index: Array = f.tensor("<i8", 1)

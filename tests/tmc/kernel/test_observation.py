@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tmc.kernel.grid import ACTIONS, OFF_GRID, STAY
-from tmc.kernel.observation import EGO, PEER, Observer
+from tmc.kernel.observation import EGO, PEER, Observer, Views
 from tmc.kernel.world import World
 
 Worlds = Callable[..., World]
@@ -73,8 +73,13 @@ def test_single_and_batch_agree_bit_for_bit(
     observer = Observer(world)
     cells, team, uav, u = states(world, seed=scenario)
     sensed = observer.sensed(cells, team, uav)
-    batch = observer.observe_batch(cells, team, sensed, u)
-    allowed = observer.allowed_batch(cells, team, sensed)
+    views = observer.views(cells, team, uav, u.astype("<f4"))
+    batch = observer.observe_batch(views)
+    allowed = observer.allowed_batch(views)
+    _, height, width = observer.shape
+    used = np.full((cells.size, height, width, 3), 7.0, np.float32).transpose(0, 3, 1, 2)  # channels last, drawn over
+    assert observer.observe_batch(views, used) is used and (used == batch).all()
+    assert (observer.observe_batch(views.rows(slice(3, 5))) == batch[3:5]).all()
     assert batch.shape == (cells.size, *observer.shape)
     assert batch.dtype == np.float32
     assert allowed.dtype == np.uint8
@@ -181,6 +186,5 @@ def test_staying_is_allowed_to_a_uav_that_is_walled_in(world_of: Worlds) -> None
     observer = Observer(world)
     assert [ACTIONS[a][0] for a in observer.allowed(0, [])] == ["stay"]
     assert observer.allowed(5, [2, 7, 8]) == [STAY]
-    sensed = np.ones((1, 4), bool)
-    sensed[0, 0] = False
-    assert observer.allowed_batch(np.array([5]), np.array([[5, 2, 7, 8]]), sensed).tolist() == [[0] * 8 + [1]]
+    walled_in = Views(np.array([5], "<u2"), np.array([[2, 7, 8]], "<u2"), np.zeros((1, 0), "<f4"))
+    assert observer.allowed_batch(walled_in).tolist() == [[0] * 8 + [1]]

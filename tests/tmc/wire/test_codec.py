@@ -19,8 +19,8 @@ from tmc.wire.messages import EMPTY, MESSAGES, PROTOCOL, Error, Map, Message, Mi
 QUICK = settings(max_examples=60, deadline=None)
 Same = Callable[[Message, Message], bool]
 BATCH = Minibatch(
-    1, 0, 0, np.zeros((2, 3, 4, 5), "<f4"), np.zeros(2, "u1"), np.zeros(2, "<f4"), np.zeros((2, 3, 4, 5), "<f4"),
-    np.zeros(2, "<f4"), np.ones((2, 9), "u1"), np.arange(2),
+    1, 0, 0, np.zeros(4, "<u2"), np.zeros((4, 1), "<u2"), np.zeros((4, 5), "<f4"),
+    np.zeros(2, "u1"), np.zeros(2, "<f4"), np.zeros(2, "<f4"), np.ones((2, 9), "u1"), np.arange(2),
 )  # fmt: skip
 ANYTHING = st.recursive(
     st.none()
@@ -260,7 +260,7 @@ def test_missing_fields_are_named_or_refused(cls: type[Message]) -> None:
         assert next(iter(cls.__dataclass_fields__)) in str(error)
 
 
-@pytest.mark.parametrize("name", ["request", "ticks", "observation", "allowed"])
+@pytest.mark.parametrize("name", ["request", "ticks", "u", "allowed"])
 def test_each_field_of_a_minibatch_must_be_there(name: str) -> None:
     assert refused(with_header(BATCH, **{name: ...})).code == "malformed"
 
@@ -289,22 +289,13 @@ def test_missing_and_extra_frames_are_refused() -> None:
 @pytest.mark.parametrize(
     "shape",
     [
-        None, 7, "2,3,4,5", b"", {}, [], [2, 3, 4], [2, 3, 4, 5, 1], [2, 3, 4, 6], [0, 3, 4, 5], [2, 3, 4, -5],
-        [2, 3, 4, 5.0], [True, 3, 4, 5], [2, 3, 4, None], [2, 3, 4, "5"], [-2, -3, 4, 5], [2**31, 0, 0, 0],
-        [2**31 - 1, 2**31 - 1, 2**31 - 1, 2**31 - 1], [2**63, 1, 1, 1],
+        None, 7, "4,5", b"", {}, [], [4], [4, 5, 1], [4, 6], [0, 5], [4, -5], [4, 5.0], [True, 20], [4, None], [4, "5"],
+        [-4, -5], [2**31, 0], [2**31 - 1, 2**31 - 1], [2**63, 1],
     ],
     ids=str,
 )  # fmt: skip
 def test_a_shape_that_does_not_fit_its_frame_is_refused(shape: Any) -> None:
-    assert refused(with_header(BATCH, observation=shape)).code == "malformed"
-
-
-@pytest.mark.parametrize("shape", [[0, 2**31 - 1, 2**31 - 1, 2**31 - 1], [2**31 - 1, 2**31 - 1, 2**31 - 1, 0]], ids=str)
-def test_an_empty_tensor_of_an_impossible_shape_is_refused(shape: list[int]) -> None:
-    """No bytes fit a shape that holds a 0, but NumPy cannot make an array of it."""
-    frames = with_header(BATCH, observation=shape)
-    frames[1] = b""
-    assert refused(frames).code in {"malformed", "range"}
+    assert refused(with_header(BATCH, u=shape)).code == "malformed"
 
 
 @pytest.mark.parametrize("change", [-4, -1, 1, 4])
@@ -318,9 +309,9 @@ def test_a_frame_of_another_size_is_refused(change: int) -> None:
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_a_tensor_is_finite(number: float) -> None:
     frames = as_bytes(BATCH)
-    poisoned = np.frombuffer(frames[1], "<f4").copy()
+    poisoned = np.frombuffer(frames[3], "<f4").copy()
     poisoned[-1] = number
-    frames[1] = poisoned.tobytes()
+    frames[3] = poisoned.tobytes()
     assert refused(frames).code == "range"
 
 
@@ -329,18 +320,18 @@ def test_a_tensor_is_finite(number: float) -> None:
 
 def test_large_arrays_are_neither_copied_on_the_way_out_nor_in() -> None:
     frames = encode(BATCH)
-    assert np.shares_memory(frames[1], BATCH.observation)
+    assert np.shares_memory(frames[3], BATCH.u)
     decoded = decode(frames)
     assert isinstance(decoded, Minibatch)
-    assert np.shares_memory(decoded.observation, BATCH.observation)
+    assert np.shares_memory(decoded.u, BATCH.u)
 
 
 def test_arrays_that_lie_otherwise_in_memory_arrive_in_order() -> None:
-    images = np.arange(120, dtype="<f4").reshape(5, 4, 3, 2).T
-    batch = dataclasses.replace(BATCH, observation=images, next_observation=images)
+    maps = np.arange(20, dtype="<f4").reshape(5, 4).T
+    batch = dataclasses.replace(BATCH, u=maps)
     decoded = decode(as_bytes(batch))
     assert isinstance(decoded, Minibatch)
-    assert (decoded.observation == images).all()
+    assert (decoded.u == maps).all()
 
 
 def test_a_frame_names_its_type_and_version() -> None:

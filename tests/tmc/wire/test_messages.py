@@ -29,7 +29,7 @@ def numbers(dtype: str, *values: float) -> NDArray[Any]:
     return np.array(values, dtype)
 
 
-IMAGES = np.arange(2 * 3 * 4 * 5, dtype="<f4").reshape(2, 3, 4, 5)
+MAPS = np.arange(4 * 5, dtype="<f4").reshape(4, 5)
 EXAMPLES: tuple[Message, ...] = (
     m.Hello("uav", 2, 12345),
     m.Hello("learner", -1, 2**63 - 1, updates=7),
@@ -49,8 +49,8 @@ EXAMPLES: tuple[Message, ...] = (
     m.Policy(4, b"\x08\x01onnx\x00"),
     m.SampleRequest(9),
     m.Minibatch(
-        9, 0, 100, IMAGES, numbers("u1", 1, 8), numbers("<f4", 1, 2), IMAGES[::-1].copy(), numbers("<f4", 0.9, 0.9),
-        np.ones((2, 9), "u1"), numbers("<i8", 0, 2**40),
+        9, 0, 100, numbers("<u2", 4, 5, 6, 7), np.arange(8, dtype="<u2").reshape(4, 2), MAPS, numbers("u1", 1, 8),
+        numbers("<f4", 1, 2), numbers("<f4", 0.9, 0.9), np.ones((2, 9), "u1"), numbers("<i8", 0, 2**40),
     ),
     m.PolicyPush(5, 100, 0.25, b"onnx"),
     m.Ack(5),
@@ -106,8 +106,9 @@ def test_frames_decode_in_the_process_that_made_them(message: Message, same: Sam
 
 def test_an_empty_minibatch_decodes_in_the_process_that_made_it(same: Same) -> None:
     """Python cannot cast a view of an empty array with several dimensions."""
-    images, none = IMAGES[:0], numbers("<f4")
-    empty = m.Minibatch(9, 0, 100, images, numbers("u1"), none, images, none, np.ones((0, 9), "u1"), np.zeros(0, "<i8"))
+    cells, peers, none = numbers("<u2"), np.zeros((0, 2), "<u2"), numbers("<f4")
+    rest = (none, none, np.ones((0, 9), "u1"), np.zeros(0, "<i8"))
+    empty = m.Minibatch(9, 0, 100, cells, peers, MAPS[:0], numbers("u1"), *rest)
     assert same(decode([bytes(frame) for frame in encode(empty)]), empty)
     assert same(decode(encode(empty)), empty)
 

@@ -1,9 +1,10 @@
-"""`python -m actors.forkserver`: starts UAV processes by fork, so that they share the memory of what they all import.
+"""`python -m deploy.forkserver --of PACKAGE`: starts processes of one kind by fork: UAVs, or the learner.
 
-It imports the actor once, before any thread or ZeroMQ context exists, and forks a UAV for each order that comes in on
+It imports the package's `__main__` once, before any thread or ZeroMQ context exists, so that they share the memory of
+what they all import, and a killed one is back without importing it again. It forks for each order that comes in on
 stdin, a line of JSON: `{"start": NAME, "argv": [...], "log": PATH}`, or `{"signal": NUMBER, "name": NAME}`. On stdout
 it says, a line of JSON each, who started (`{"name": NAME, "pid": PID}`) and who ended
-(`{"name": NAME, "code": CODE}`, negative for a signal). UAVs die with it, and it dies with its supervisor.
+(`{"name": NAME, "code": CODE}`, negative for a signal). They die with it, and it dies with its supervisor.
 """
 
 from __future__ import annotations
@@ -19,23 +20,24 @@ import select
 import signal
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # as in actors.__main__: before NumPy is imported
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-from actors import __main__ as actor
 from tmc.wire import process
 
-TITLE = ("python", "-P", "-m", "actors")
-"""What the command line of a UAV begins with, for `ps` and whoever else looks for it."""
+TITLE = ("python", "-P", "-m")
+"""What a command line begins with, for `ps` and whoever else looks for it; the name of the package follows."""
+
+Main = Callable[[list[str]], int]
+"""What a process runs with its arguments; returns the exit code."""
 
 
 class ForkServer:
-    """Forks UAVs at the word of the supervisor, and reaps them."""
+    """Forks processes that run `main`, called `package`, at the word of the supervisor, and reaps them."""
 
-    def __init__(self) -> None:
+    def __init__(self, package: str, main: Main) -> None:
+        self._package, self._main = package, main
         self._pids: dict[str, int] = {}
         self._names: dict[int, str] = {}
         self._ended, wake = os.pipe()
@@ -72,7 +74,7 @@ class ForkServer:
         server = os.getpid()
         pid = os.fork()
         if pid == 0:
-            become(server, self._ends, argv, log)
+            become(self._package, self._main, server, self._ends, argv, log)
         self._pids[name], self._names[pid] = pid, name
         _say({"name": name, "pid": pid})
 
@@ -92,8 +94,8 @@ def _say(report: dict[str, Any]) -> None:
         data = data[os.write(1, data) :]
 
 
-def become(server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
-    """Turn the forked process into the UAV of `argv`, with nothing of the server's but its memory; never returns."""
+def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
+    """Turn the forked process into that of `argv`, with nothing of the server's but its memory; never returns."""
     code = process.FAILED
     try:
         signal.set_wakeup_fd(-1)
@@ -104,9 +106,9 @@ def become(server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoR
             os.dup2(old, new)
         for end in (*ends, output):
             os.close(end)
-        set_title((*TITLE, *argv))
+        set_title((*TITLE, package, *argv))
         process.die_with_parent(server)
-        code = actor.main(argv)
+        code = main(argv)
     except SystemExit as left:  # argparse
         code = left.code if isinstance(left.code, int) else process.FAILED
     except BaseException:  # the traceback belongs into the log, and nothing may get back into the server's loop
@@ -135,20 +137,22 @@ def set_title(words: tuple[str, ...]) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Import, freeze, serve."""
-    parser = argparse.ArgumentParser("actors.forkserver", description=__doc__)
-    parser.add_argument("--preload", action="append", default=[], metavar="MODULE", help="what all UAVs will need")
+    parser = argparse.ArgumentParser("deploy.forkserver", description=__doc__)
+    parser.add_argument("--of", required=True, metavar="PACKAGE", help="whose __main__ the processes run")
+    parser.add_argument("--preload", action="append", default=[], metavar="MODULE", help="what all of them will need")
     parser.add_argument("--out", default="", help="the run's folder, to be found by")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
-    parser.add_argument("--room", default="", help="space for the command lines of the UAVs")
+    parser.add_argument("--room", default="", help="space for the command lines of the processes")
     a = parser.parse_args(argv)
     process.die_with_parent(a.parent)
-    set_title((*TITLE[:-1], "actors.forkserver", "--out", a.out, "--parent", str(a.parent)))
+    set_title((*TITLE, "deploy.forkserver", "--of", a.of, "--out", a.out, "--parent", str(a.parent)))
+    program = importlib.import_module(f"{a.of}.__main__")
     for module in a.preload:
         importlib.import_module(module)
     gc.collect()
-    gc.freeze()  # what is here now is never collected, so a collection in a UAV does not copy its pages
+    gc.freeze()  # what is here now is never collected, so a collection in a process does not copy its pages
     with contextlib.suppress(BrokenPipeError):
-        ForkServer().serve()
+        ForkServer(a.of, program.main).serve()
     return process.DONE
 
 

@@ -1,0 +1,31 @@
+"""The command as tests give it: to a process of its own, as a user does, or here, which saves the start of a Python."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+from deploy.cli import main
+
+LINE = (sys.executable, "-P", "-m", "deploy.cli")
+"""How `overfly` is started, whatever lies in the folder that it is started in."""
+
+
+def overfly(*args: object, cwd: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    """`overfly ARGS` in a process of its own."""
+    line = [*LINE, *map(str, args)]
+    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def here(*args: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """`overfly ARGS` in this process: for what starts no process, or is not about them."""
+    line, out, err = [*map(str, args)], io.StringIO(), io.StringIO()
+    with contextlib.chdir(cwd), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main(line)
+        except SystemExit as left:  # argparse
+            code = left.code if isinstance(left.code, int) else 1
+    return subprocess.CompletedProcess(line, code, out.getvalue(), err.getvalue())
