@@ -17,6 +17,7 @@ from tmc.kernel.config import flat
 from tmc.kernel.world import World
 from tmc.record import builders
 from tmc.record.channels import ACTIVE, CHANNELS
+from tmc.record.disk import put
 from tmc.record.schemas import message_class
 from tmc.record.writer import LogWriter
 from tmc.roster import Outbox
@@ -35,6 +36,7 @@ class Journal:
         self.found = resume and journal_in(folder) is not None
         self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run}, resume=resume)
         self._policies: set[int] = set()
+        self._stale = {*policies_in(folder)} if self.found else set[int]()
         self._since: float | None = None
         if not self.found:
             self._begin(world)
@@ -82,16 +84,14 @@ class Journal:
                 file.write(f"{now.st_ino} {now.st_size}\n")
 
     def keep_policies(self, held: Mapping[int, bytes]) -> None:
-        """Make the folder `policies` hold these files, and none of those that it held before."""
+        """Make the folder `policies` hold these policies, and none of those that it held before."""
         for version in held.keys() - self._policies:
             path = policy_path(self.folder, version)
             path.parent.mkdir(parents=True, exist_ok=True)
-            new = path.with_suffix(".new")
-            new.write_bytes(held[version])
-            new.replace(path)
-        for version in self._policies - held.keys():
+            put(path, held[version], sync=self.world.config.journal.durability == "power")
+        for version in (self._policies | self._stale) - held.keys():
             policy_path(self.folder, version).unlink(missing_ok=True)
-        self._policies = set(held)
+        self._policies, self._stale = set(held), set()
 
     def _message(self, entry: Entry) -> Any:
         if "record" in entry.values:
@@ -111,6 +111,12 @@ def journal_in(folder: Path) -> Path | None:
 def policy_path(folder: Path, version: int) -> Path:
     """Where the TMC keeps the policy with this version while a UAV may ask for it."""
     return folder / "policies" / f"policy-{version}.onnx"
+
+
+def policies_in(folder: Path) -> list[int]:
+    """The versions of the policy files in a run folder."""
+    names = (path.stem.removeprefix("policy-") for path in (folder / "policies").glob("policy-*.onnx"))
+    return [int(name) for name in names if name.isdecimal()]
 
 
 def roads_geojson(world: World) -> str:

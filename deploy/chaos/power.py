@@ -12,7 +12,6 @@ UNSYNCED = (
     f"uav-*.mcap{ACTIVE}",
     f"learner.mcap{ACTIVE}",
     "*.mcap.active.new",
-    "policies/policy-*.onnx",
     "learner.run",
 )
 """Files of a run that nobody waits for the disk with."""

@@ -426,6 +426,23 @@ def test_policy_files(mission: Callable[..., Any], town: RoadMap, tmp_path: Path
     assert station.policies.find(newest) == (found or (newest + 1, b"next"))
 
 
+@pytest.mark.parametrize("durability", ["process", "power"])
+def test_a_journal_that_goes_on_leaves_only_the_policies_that_are_held(
+    flown: Any, tmp_path: Path, durability: str
+) -> None:
+    """Those of an earlier life too, and each as it is held now, whatever stands in the file of that name."""
+    journalled(tmp_path / "run", flown.world, flown.entries[:3])
+    for name in ("policy-3.onnx", "policy-7.onnx", "final.onnx"):
+        (tmp_path / "run" / "policies").mkdir(exist_ok=True)
+        (tmp_path / "run" / "policies" / name).write_bytes(b"old")
+    world = World(build({"journal.durability": durability}, flown.world.config), flown.world.map)
+    journal = Journal(tmp_path / "run", world, "run", resume=True)
+    journal.keep_policies({7: b"seven", 8: b"eight"})
+    journal.writer.close()
+    files = {path.name: path.read_bytes() for path in (tmp_path / "run" / "policies").iterdir()}
+    assert files == {"final.onnx": b"old", "policy-7.onnx": b"seven", "policy-8.onnx": b"eight"}
+
+
 def test_a_process_that_has_flown_nothing_yet_is_missed_too(flown: Any, tmp_path: Path) -> None:
     """Its life is in no record: it is given up after the same silence as the others, and not waited for for ever."""
     path = journalled(tmp_path / "run", flown.world, flown.entries[: at(flown.entries, "/tmc/episode", 0) + 1])

@@ -76,6 +76,19 @@ def sync_folder(folder: Path) -> None:
         os.close(number)
 
 
+def put(path: Path, content: bytes, *, sync: bool) -> None:
+    """Write a file whole or not at all; with `sync`, wait until the disk has it."""
+    new = path.with_suffix(".new")
+    with new.open("wb") as file:
+        file.write(content)
+        if sync:
+            file.flush()
+            os.fsync(file.fileno())
+    new.replace(path)
+    if sync:
+        sync_folder(path.parent)
+
+
 def unwritable(path: Path, error: OSError) -> str:
     """Why a log cannot be written, and the mend."""
     if error.errno in FULL:
