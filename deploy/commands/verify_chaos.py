@@ -91,15 +91,21 @@ def _blows(args: argparse.Namespace, config: Config) -> list[Blow]:
     return blows(args.kills, args.storm, names, power=args.power)
 
 
+def everybody(storm: Storm) -> list[float]:
+    """Seconds that each recovery took, whoever was killed."""
+    return [took for role in ROLES for took in storm.recoveries[role]]
+
+
 def table(verdict: trial.Verdict) -> Iterator[str]:
     """What was done, and what came of it."""
     storm = verdict.storm
     yield f"{'killed':<14} {'times':>6} {'came back':>10} {'median':>9} {'worst':>9}"
-    for role in ROLES:
-        if storm.kills[role]:
-            took = storm.recoveries[role]
+    lines = [(role, storm.kills[role], storm.backs[role], storm.recoveries[role]) for role in ROLES]
+    lines += [("all", sum(storm.kills.values()), sum(storm.backs.values()), everybody(storm))]
+    for role, kills, backs, took in lines:
+        if kills:
             times = f"{median(took):>7.2f} s {max(took):>7.2f} s" if took else f"{'-':>9} {'-':>9}"
-            yield f"{'power cut' if role == POWER else role:<14} {storm.kills[role]:>6} {storm.backs[role]:>10} {times}"
+            yield f"{'power cut' if role == POWER else role:<14} {kills:>6} {backs:>10} {times}"
     rows = [("stopped a while", storm.count(STOP)), ("cut off a while", storm.count(CUT))]
     rows += [("journal cut, bytes", storm.cut_off)] if storm.kills[POWER] else []
     rows += [("missions", verdict.missions)]
@@ -130,7 +136,7 @@ def as_json(verdict: trial.Verdict, seconds: float) -> dict[str, Any]:
     return {
         "kills": dict(storm.kills), "back": dict(storm.backs), "stops": storm.count(STOP), "cuts": storm.count(CUT),
         "recovery": {role: {"median": round(median(took), 3), "worst": round(max(took), 3)}
-                     for role, took in storm.recoveries.items()},
+                     for role, took in (*storm.recoveries.items(), ("all", everybody(storm))) if took},
         "missions": verdict.missions, **{name: verdict.sum(name) for name in counts}, "facts": verdict.facts,
         "bytes_cut": storm.cut_off, "faults": verdict.faults, "seconds": round(seconds, 1),
     }  # fmt: skip
