@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.airspace import Airspace, Tracks
-from actors.planners import Decider, Sight
+from actors.planners import Decider, Sight, Valued
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
@@ -23,6 +23,7 @@ from tmc.kernel.uncertainty import merge
 from tmc.kernel.world import World
 from tmc.wire.messages import EMPTY, Begin, Lost, Map, Policy, PolicyRequest, Record
 
+NONE: NDArray[np.float32] = np.zeros(0, "<f4")
 STINT = 32
 """Ticks that a pilot flies at most before it looks up."""
 
@@ -52,6 +53,7 @@ class Leg:
     blocks: list[int] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
     seen: list[tuple[int, int]] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
 
 
 class Pilot:
@@ -72,6 +74,8 @@ class Pilot:
         self.airspace = Airspace(uav, self.config.team.size, world.grid, observer.sensing, tracks)
         self.reward = RewardLaw(self.config, world.law.q)
         self.decider, self._make_decider, self._planner = planner, make_decider, planner
+        self._valued: Valued | None = None
+        """The policy, where each move is told with what it is worth (`replay.priority`)."""
         self.phase = Phase.IDLE
         self.episode = self.t = self.cell = self.previous = self.sequence = self.version = 0
         self.policy = self.wanted = 0
@@ -152,6 +156,9 @@ class Pilot:
         """The policy that was asked for. Raises PolicyError when it cannot fly here."""
         if self.phase is Phase.POLICY and policy.version >= self.wanted:
             self.decider = self._make_decider(policy.model)
+            if self.config.replay.priority:
+                assert isinstance(self.decider, Valued)
+                self._valued = self.decider
             self.policy, self.phase = policy.version, self._then
 
     # Flying.
@@ -203,6 +210,7 @@ class Pilot:
             np.array(leg.cells, "<u2"), np.array(leg.actions, "u1"), np.array(leg.blocks, "u1"),
             np.array(leg.rewards, "<f4"),
             EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
+            np.nan_to_num(np.array(leg.values, "<f4")) if leg.values else NONE,  # a message takes finite numbers only
         )  # fmt: skip
         self.spool.append(self.pending)
         self.sequence += 1
@@ -228,6 +236,7 @@ class Pilot:
             self.phase = Phase.IDLE
             return
         explore, draw = self._draws[self.t]
+        sight = None
         if self._planner is None and explore < self._epsilon:
             self.explored += 1
             mask = self.config.exploration.mask_blocked
@@ -235,7 +244,10 @@ class Pilot:
             self.action = choices[int(draw * len(choices))]
         else:
             assert self.decider is not None
-            self.action = self.decider.choose(self.sight())
+            sight = self.sight()
+            self.action = self.decider.choose(sight)
+        if self._valued is not None:
+            self.leg.values += self._valued.worth(sight or self.sight(), self.action)
         self.phase = Phase.MOVE
 
     def _move(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,15 @@ class Decider(Protocol):
     """A policy or a planner: chooses an action id."""
 
     def choose(self, sight: Sight) -> int: ...
+
+
+@runtime_checkable
+class Valued(Decider, Protocol):
+    """A policy: it also knows what actions are worth."""
+
+    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+        """Q(o, a), and the largest Q(o, .) of an action that may be chosen."""
+        ...
 
 
 Planner = Callable[[World, Sight], int]

@@ -44,6 +44,7 @@ class NetworkDecider:
         require(card, config, observer.grid)
         self._mask, self._canvas = config.exploration.mask_blocked, observer.canvas()
         self._q = np.zeros((1, N_ACTIONS), np.float32)
+        self._seen: Sight | None = None
         self._check()
         self._bound = self._bind()
 
@@ -71,8 +72,21 @@ class NetworkDecider:
         return q
 
     def choose(self, sight: Sight) -> int:
-        self._canvas.draw(sight.cell, sight.peers, sight.u)
-        q = self.q_values()
+        q = self._look(sight)
         if self._mask:
             return max(sight.allowed, key=q.tolist().__getitem__)
         return int(q.argmax())
+
+    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+        """Q(o, a), and the largest Q(o, .) among the actions that `choose` chooses from."""
+        q = self._look(sight).tolist()
+        return q[action], max(q[a] for a in sight.allowed) if self._mask else max(q)
+
+    def _look(self, sight: Sight) -> np.ndarray[Any, np.dtype[np.float32]]:
+        """Q of what is in sight; who asks again about the last one gets what was computed."""
+        if sight is not self._seen:
+            self._canvas.draw(sight.cell, sight.peers, sight.u)
+            self.q_values()
+            self._seen = sight
+        q: np.ndarray[Any, np.dtype[np.float32]] = self._q[0]
+        return q

@@ -11,7 +11,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from actors.planners import Decider, Sight
+from actors.planners import Decider, Sight, Valued
 from tmc.kernel.observation import Observer
 from tmc.record.builders import record_digest
 from tmc.record.schemas import Witness as Testimony
@@ -59,6 +59,10 @@ class _Watched:
     def choose(self, sight: Sight) -> int:
         self._witness.see(sight)
         return self._decider.choose(sight)
+
+    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+        assert isinstance(self._decider, Valued)
+        return self._decider.worth(sight, action)
 
 
 class Oath:

@@ -110,7 +110,7 @@ class LockStep:
             learned = True
             if metrics.updates % self.world.config.training.push_every == 0:
                 self._push(metrics.loss)
-            self._tell(m.SampleRequest(metrics.updates))
+            self._tell(m.SampleRequest(metrics.updates, *trainer.judged()))
         return learned
 
     def _push(self, loss: float = 0.0) -> None:

@@ -47,8 +47,14 @@ def td_error(q: Tensor, action: Tensor, y: Tensor) -> Tensor:
     return of(q, action) - y
 
 
-def loss(td: Tensor, kind: Literal["mse", "huber"] = "mse") -> Tensor:
-    """Eq. (13): the mean squared error over the minibatch; or (ours) Huber: td^2 / 2, linear beyond |td| = 1."""
+def loss(td: Tensor, kind: Literal["mse", "huber"] = "mse", weight: Tensor | None = None) -> Tensor:
+    """Eq. (13): the mean squared error over the minibatch; or (ours) Huber: td^2 / 2, linear beyond |td| = 1.
+
+    `weight` (B,): what each transition counts (ours, `replay.priority`); the paper has none, and so all count alike.
+    """
+    if weight is not None:
+        each = huber_loss(td, torch.zeros_like(td), reduction="none") if kind == "huber" else td.square()
+        return (weight * each).mean()
     if kind == "huber":
         return huber_loss(td, torch.zeros_like(td), delta=1.0)
     return td.square().mean()

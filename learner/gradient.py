@@ -27,22 +27,25 @@ class Gradient:
         self._weights = list(net.parameters())
         self._helpers = ThreadPoolExecutor(max(1, self.threads - 1), "gradient", torch.set_num_threads, (1,))
 
-    def __call__(self, o: Tensor, action: Tensor, y: Tensor) -> Share:
-        """(the gradient for each of the weights, Q(o, a; theta) (B,), the loss ()), against targets y (B,)."""
+    def __call__(self, o: Tensor, action: Tensor, y: Tensor, weight: Tensor | None = None) -> Share:
+        """(the gradient for each of the weights, Q(o, a; theta) (B,), the loss ()), against targets y (B,).
+
+        `weight` (B,): as in `dqn.loss`.
+        """
         b, n = len(y), min(self.threads, len(y))
         parts = [slice(b * k // n, b * (k + 1) // n) for k in range(n)]
-        waiting = [self._helpers.submit(self._share, o[p], action[p], y[p], b) for p in parts[1:]]
-        p = parts[0]
-        shares = [self._share(o[p], action[p], y[p], b), *(w.result() for w in waiting)]
+        of = [(o[p], action[p], y[p], None if weight is None else weight[p], b) for p in parts]
+        waiting = [self._helpers.submit(self._share, *part) for part in of[1:]]
+        shares = [self._share(*of[0]), *(w.result() for w in waiting)]
         if n == 1:
             return shares[0]
         gradients, q, losses = zip(*shares, strict=True)
         total = [torch.stack(same).sum(0) for same in zip(*gradients, strict=True)]
         return total, torch.cat(q), torch.stack(losses).sum()
 
-    def _share(self, o: Tensor, action: Tensor, y: Tensor, b: int) -> Share:
+    def _share(self, o: Tensor, action: Tensor, y: Tensor, weight: Tensor | None, b: int) -> Share:
         """What these transitions of a minibatch of `b` have in it."""
         q = self.net(o)
-        loss = dqn.loss(dqn.td_error(q, action, y), self.loss) * (len(y) / b)
+        loss = dqn.loss(dqn.td_error(q, action, y), self.loss, weight) * (len(y) / b)
         gradient = torch.autograd.grad(loss, self._weights)
         return list(gradient), dqn.of(q.detach(), action), loss.detach()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ class Batch:
     discount: Floats
     allowed: NDArray[np.uint8]
     index: NDArray[np.int64]
+    weight: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
 
 
 class Intake:
@@ -57,7 +58,7 @@ class Intake:
 
         now = self.observer.observe_batch(views.rows(slice(b)), self._now)
         m = minibatch
-        return Batch(m.episodes, now, following, m.action, m.reward, m.discount, m.allowed, m.index)
+        return Batch(m.episodes, now, following, m.action, m.reward, m.discount, m.allowed, m.index, m.weight)
 
     def _memory(self, b: int) -> Floats:
         """Shape (b, C, H, W), in memory (b, H, W, C)."""
@@ -92,6 +93,8 @@ def check(batch: Batch, shape: Shape) -> None:
         raise TrainingError(f"the minibatch's fields differ in length: each must have {b} rows")
     if batch.index.shape != (b,) or int(batch.index.min()) < 0:
         raise TrainingError(f"the minibatch's transitions are not numbered: `index` must have {b} numbers from 0 on")
+    if batch.weight.shape not in ((b,), (0,)):
+        raise TrainingError(f"the minibatch has {batch.weight.size} weights: it must have {b}, or none")
     if int(batch.action.max()) >= N_ACTIONS:
         raise TrainingError(f"the minibatch has an action {batch.action.max()}: a UAV has {N_ACTIONS}")
     if not batch.allowed.any(axis=1).all():

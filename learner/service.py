@@ -135,7 +135,7 @@ class Service:
 
     def _ask(self) -> None:
         self._request += 1
-        sockets.send(self.sock, m.SampleRequest(self._request))
+        sockets.send(self.sock, m.SampleRequest(self._request, *self.trainer.judged()))
 
     def _update(self, minibatch: m.Minibatch) -> None:
         metrics = self.trainer.update(self.intake.read(minibatch))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from learner import dqn, qnet
@@ -25,13 +26,15 @@ from tmc.kernel.grid import Grid
 from tmc.kernel.observation import Floats
 from tmc.kernel.policy import card_for, view_shape
 
+NOTHING = np.zeros(0, np.int64), np.zeros(0, np.float32)
+
 
 @dataclass(frozen=True)
 class UpdateMetrics:
     """What update number `updates` did. Means over the minibatch; values in scaled reward, as the network has them.
 
-    `loss`: eq. (9). `q_mean`: Q(o, a; theta). `target_mean`: y of eq. (8). `td_abs`: |Q - y|. `grad_norm`: Euclidean,
-    over all weights.
+    `loss`: eq. (9), weighted where the minibatch says so. `q_mean`: Q(o, a; theta). `target_mean`: y of eq. (8).
+    `td_abs`: |Q - y|. `grad_norm`: Euclidean, over all weights.
     """
 
     updates: int
@@ -70,6 +73,7 @@ class Trainer:
         self.adam = Adam(self.online.parameters(), config.dqn.learning_rate)
         self._gradient = Gradient(self.online, config)
         self._known = Known(config.replay.capacity)
+        self._judged = NOTHING
 
     def update(self, batch: Batch) -> UpdateMetrics:
         """One step of Adam on eq. (9), and theta- = theta when that is due. Raises TrainingError."""
@@ -77,8 +81,11 @@ class Trainer:
         self._follow(batch.episodes)
         y = self._target(batch)
         action = torch.tensor(batch.action, dtype=torch.int64)
-        gradient, q, loss = self._gradient(laid_out(batch.observation), action, y)
+        weight = torch.tensor(batch.weight) if batch.weight.size else None
+        gradient, q, loss = self._gradient(laid_out(batch.observation), action, y, weight)
         metrics = self._step(gradient, q, loss, y)
+        if self.config.replay.priority:
+            self._judged = batch.index, (q - y).abs().numpy()
         every = self.config.dqn.target_updates
         if every and self.updates % every == 0:
             self._copy()
@@ -102,9 +109,18 @@ class Trainer:
                 self._known.keep(batch.index[rest], values[rest])
         return values
 
+    def judged(self) -> tuple[NDArray[np.int64], Floats]:
+        """The transitions of the last update, by number, and |Q - y| of each; told once. Shapes (B,), or empty.
+
+        Their new priorities (Schaul et al. 2016, Algorithm 1): nothing where `replay.priority` is 0.
+        """
+        judged, self._judged = self._judged, NOTHING
+        return judged
+
     def forget(self) -> None:
         """The numbers of transitions begin anew: what was known of them is of others."""
         self._known.forget()
+        self._judged = NOTHING
 
     def _step(self, gradient: list[Tensor], q: Tensor, loss: Tensor, y: Tensor) -> UpdateMetrics:
         """A step of Adam down the gradient of `loss`; `q` (B,) = Q(o, a; theta), `y` (B,)."""
@@ -167,7 +183,7 @@ class Trainer:
         for name, tensor in mine.items():  # in place: the fused Adam wants moments laid out as the weights are
             tensor.copy_(state.tensors[name])
         self.updates, self.version, self.copied = state.updates, state.version, state.copied
-        self._known.forget()
+        self.forget()
 
 
 def copy_due(finished: int, copied: int, f: int) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from tmc.limiter import Limiter
 from tmc.replay import Replay
-from tmc.wire.messages import Hello, Minibatch
+from tmc.wire.messages import Hello, Minibatch, SampleRequest
 
 WINDOW = 8
 """Most requests that may be in flight."""
@@ -30,12 +30,19 @@ class Feed:
             self.limiter.updates = hello.updates if self.recovered else min(self.limiter.updates, hello.updates)
             self.recovered = False
 
-    def ask(self, request: int) -> bool:
-        """Take a request; False when too many are in flight already."""
+    def ask(self, request: SampleRequest) -> str | None:
+        """Take a request and the errors that come with it; or say what is wrong with it, and change nothing."""
         if len(self._requests) >= WINDOW:
-            return False
-        self._requests.append(request)
-        return True
+            return f"more than {WINDOW} minibatch requests in flight"
+        index, errors, priorities = request.index, request.errors, self.replay.priorities
+        if index.size != errors.size or (errors < 0.0).any() or (index < 0).any():
+            return "a minibatch request has an error for each transition, and neither errors nor numbers below 0"
+        if index.size and priorities is None:
+            return "a minibatch request has errors, but replay.priority is 0"
+        if priorities is not None and self.life >= 0:  # before it is welcome, a learner may mean other transitions
+            priorities.set(index, errors)
+        self._requests.append(request.request)
+        return None
 
     def serve(self, episodes: int, ticks: int) -> Iterator[Minibatch]:
         """A minibatch for each request for which one is owed; none before the learner was welcomed.
@@ -47,5 +54,5 @@ class Feed:
             self.limiter.sample()
             yield Minibatch(
                 self._requests.pop(0), episodes, ticks, s.views.cells, s.views.peers, s.views.u,
-                s.action, s.reward, s.discount, s.allowed, s.index,
+                s.action, s.reward, s.discount, s.allowed, s.index, s.weight,
             )  # fmt: skip

@@ -17,6 +17,7 @@ from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge, step_events
 from tmc.kernel.world import World
+from tmc.priorities import first_errors
 from tmc.replay import Replay
 from tmc.wire.messages import EMPTY, Begin, Map, Record
 
@@ -78,6 +79,9 @@ class Flight:
         self.blocks = np.zeros((self.T + 1, self.N), "u1")
         self.own_rewards = np.zeros((self.T + 1, self.N), "<f4")
         self.base = np.zeros((self.T + 1, self.N), np.int64)
+        self._values = np.full((self.T + 1, self.N, 2), np.nan, "<f4") if config.replay.priority else None
+        """Q(o_t, a_t) and max_a Q(o_t, a), by the tick t of the decision, as the UAVs reckoned them."""
+        self._judged = 0
         self.reported = [-1] * self.N
         self.lost: dict[int, int] = {}
         """Lost UAVs, and the tick of their last record."""
@@ -114,6 +118,8 @@ class Flight:
         self.actions[moves, i] = record.actions
         self.blocks[moves, i] = record.blocks
         self.own_rewards[moves, i] = record.rewards
+        if self._values is not None and record.values.size:
+            self._values[moves.start - 1 : last, i] = record.values.reshape(-1, 2)
         self.reported[i] = last
         index, belief = self.world.law.index_list, self.beliefs[i]
         for tick, cell in enumerate(record.cells.tolist(), first):
@@ -135,6 +141,9 @@ class Flight:
         moves = r.tick - max(r.first, 1) + 1
         if not (r.cells.size == r.tick - r.first + 1 and r.actions.size == r.blocks.size == r.rewards.size == moves):
             raise RefusedError(f"record of UAV {r.uav} has arrays that do not match its ticks {r.first}..{r.tick}")
+        valued = self._values is not None and self.world.config.team.pilot == "policy"
+        if r.values.size != (2 * moves if valued else 0):
+            raise RefusedError(f"record of UAV {r.uav} has {r.values.size} values of {moves} moves: two each, or none")
         self._check_path(r)
         ticks, cells = r.seen_tick.tolist(), r.seen_cell.tolist()
         if len(ticks) != len(cells) or any(not r.first <= t <= r.tick for t in ticks):
@@ -239,12 +248,27 @@ class Flight:
             sure = [self._sure(t) for t in range(truth.first, self.done + 1)]
             rows = (self.cells[ticks], self.actions[ticks], self.rewards[ticks], self.base[ticks])
             self.replay.add_rows(self.episode, truth.first, *rows, sure)
+            if self._values is not None:
+                self._judge(self._values)
         return truth
+
+    def _judge(self, values: NDArray[np.float32]) -> None:
+        """First priorities (Horgan et al. 2018, Sec. 3) of the transitions for which the values are final by now.
+
+        A transition from t needs max_a Q(o_{t+1}, a), which comes with the move from t + 1: the last one of an episode
+        has none. With n-step sums the 1-step error stands for that of the whole transition.
+        """
+        dqn, first = self.world.config.dqn, self._judged
+        self._judged = self.T - 1 if self.done == self.T else max(self.done + 1 - max(2, dqn.n_step), first)
+        ticks, following = slice(first, self._judged), slice(first + 1, self._judged + 1)
+        errors = first_errors(dqn.reward_scale * self.rewards[following], values[ticks], dqn.gamma, values[following])
+        self.replay.judge(self.replay.rows_in - 1 - self.done + first, errors)
 
     def _sure(self, t: int) -> bool:
         """False for the ticks at which nobody knows whom a lost UAV was seen by: until its next exchange it may have
-        been seen, and that seeing remembered until the exchange after it."""
-        return not any(last < t <= last + 2 * self.world.config.T_u for last in self.lost.values())
+        been seen, and that seeing remembered until the exchange after it. And where nobody is left."""
+        lost, long = self.lost.values(), 2 * self.world.config.T_u
+        return bool(self.present(t)) and not any(last < t <= last + long for last in lost)
 
     def lose(self, uav: int) -> int:
         """Go on without a UAV: its visits count up to its last record, the tick of which is returned."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from tmc import entries, relay, roster
 from tmc.early import Early
-from tmc.feed import WINDOW, Feed
+from tmc.feed import Feed
 from tmc.flight import Exchange, Flight, Truth
 from tmc.kernel.config import flat
 from tmc.kernel.observation import Observer
@@ -271,10 +271,11 @@ class Station:
     # The learner.
 
     def _sample_request(self, sender: str, request: m.SampleRequest, _now: float) -> None:
-        if self.feed.ask(request.request):
+        problem = self.feed.ask(request)
+        if problem is None:
             self._serve()
         else:
-            self.reject(sender, "refused", f"more than {WINDOW} minibatch requests in flight")
+            self.reject(sender, "refused", problem)
 
     def _serve(self) -> None:
         """Answer minibatch requests as far as the limiter allows."""

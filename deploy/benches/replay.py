@@ -1,34 +1,44 @@
 """`overfly bench replay`: what the replay memory weighs, takes in and gives out, on one core, without processes.
 
 It is filled with flights at random, an exchange at a time as the TMC fills it, until it holds `replay.capacity`
-transitions. Times are the processor's, so a busy machine changes them less.
+transitions. A minibatch is drawn, and its images into memory that is used again, as TMC and learner do it between them.
+All is measured in a process with the TMC's environment, in which freed memory is kept. Times are the processor's, so a
+busy machine changes them less.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy import settings
+from deploy import plan, settings
 from deploy.benches.row import Row
 from deploy.mission import check
-from tmc.kernel.config import ConfigError
+from tmc.kernel.config import ConfigError, build, flat
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import Floats, Observer
 from tmc.kernel.world import World
-from tmc.replay import Replay
+from tmc.replay import Replay, Ring
 
-LIMITS = {"bytes": 100.0, "memory": 60.0, "minibatch": 1.5, "inserts": 100_000.0}
-"""What is asked of 100,000 transitions of the paper: bytes each, MB in all, ms a minibatch, and at least inserts/s."""
+LIMITS = {"bytes": 100.0, "memory": 60.0, "minibatch": 1.5, "inserts": 100_000.0, "prioritised": 3.0}
+"""What is asked of 100,000 transitions of the paper: bytes each, MB in all, ms a minibatch, at least inserts/s, ms a
+minibatch that is drawn by priorities and then changes them."""
+ALPHA = 0.6
+"""The exponent of priorities where the settings have none (Schaul et al. 2016, Table 3; Horgan et al. 2018)."""
+WARM = 5
+"""Minibatches that are not timed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,24 +48,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Fill it, then draw from it; one row a figure."""
+    """Fill it, then draw from it, in a process of its own; one row a figure."""
     if args.minibatches < 1:
         raise ConfigError("--minibatches must be 1 or more")
     world = check(settings.config_for("paper", settings.chosen(args)))
+    command = [sys.executable, "-P", "-m", "deploy.benches.replay", "--minibatches", str(args.minibatches)]
+    told = json.dumps(flat(world.config))
+    done = subprocess.run(
+        command, input=told, env=plan.environment("tmc", 1), stdout=subprocess.PIPE, text=True, check=True
+    )  # fmt: skip
+    held, batch, found = (
+        f"{world.config.replay.capacity:,} transitions",
+        world.config.dqn.batch,
+        json.loads(done.stdout),
+    )
+    return [
+        _row(held, found["bytes"], "bytes each", "bytes"),
+        _row(f"{held} with priorities", found["bytes with priorities"], "bytes each", "bytes"),
+        _row("process above an empty one", found["memory"], "MB", "memory"),
+        _row(f"a minibatch of {batch}", median(found["uniform"]), "ms", "minibatch"),
+        _row("the fastest of them", min(found["uniform"]), "ms", "minibatch"),
+        _row("prioritised, and its update", median(found["prioritised"]), "ms", "prioritised"),
+        _row("inserts", found["inserts"], "transitions/s", "inserts"),
+    ]
+
+
+def weigh(values: dict[str, Any], minibatches: int) -> dict[str, Any]:
+    """The figures: without priorities and with them. `memory`: None where the system does not tell."""
+    world = World(build({**values, "replay.priority": 0.0}))
     before = _resident()
     replay = Replay(world, Observer(world))
     inserted, spent = fill(replay)
     grown = None if before is None else (_resident() or before) - before
-    times = [_drawn(replay, number) for number in range(args.minibatches + 5)][5:]
-    held = len(replay)
-    arrays = sum(ring.data.nbytes for ring in vars(replay).values() if hasattr(ring, "data"))
-    return [
-        _row(f"{held:,} transitions", arrays / held, "bytes each", "bytes"),
-        _row("process above an empty one", grown, "MB", "memory"),
-        _row(f"a minibatch of {world.config.dqn.batch}", median(times), "ms", "minibatch"),
-        _row("the fastest of them", min(times), "ms", "minibatch"),
-        _row("inserts", inserted / spent, "transitions/s", "inserts"),
-    ]
+    found: dict[str, Any] = {"bytes": weight(replay), "memory": grown, "inserts": inserted / spent}
+    found["uniform"] = drawn(replay, minibatches)
+    world = World(build({**values, "replay.priority": values["replay.priority"] or ALPHA}))
+    replay = Replay(world, Observer(world))
+    fill(replay)
+    return {**found, "bytes with priorities": weight(replay), "prioritised": drawn(replay, minibatches)}
+
+
+def weight(replay: Replay) -> float:
+    """Bytes a transition."""
+    arrays = sum(ring.data.nbytes for ring in vars(replay).values() if isinstance(ring, Ring))
+    return (arrays + (replay.priorities.nbytes if replay.priorities else 0)) / len(replay)
+
+
+def drawn(replay: Replay, minibatches: int) -> list[float]:
+    """Milliseconds of the processor that each of so many minibatches takes."""
+    batch, (channels, height, width) = replay.world.config.dqn.batch, replay.observer.shape
+    images = np.empty((2 * batch, height, width, channels), np.float32).transpose(0, 3, 1, 2)  # as the learner has them
+    errors = np.random.Generator(np.random.Philox(0)).exponential(size=(minibatches + WARM, batch))
+    return [_drawn(replay, number, images, of.astype("f4")) for number, of in enumerate(errors)][WARM:]
 
 
 def _row(case: str, value: float | None, unit: str, limit: str) -> Row:
@@ -72,10 +116,13 @@ def _resident() -> float | None:
     return int(found[1]) * 1024 / 1e6 if found else None
 
 
-def _drawn(replay: Replay, number: int) -> float:
-    """Milliseconds of the processor that minibatch `number` takes."""
+def _drawn(replay: Replay, number: int, images: Floats, errors: Floats) -> float:
+    """Milliseconds of the processor that minibatch `number` takes; `errors` (B,) are found in it afterwards."""
     start = time.process_time()
-    replay.sample(number, replay.world.config.dqn.batch)
+    sample = replay.sample(number, replay.world.config.dqn.batch)
+    replay.observer.observe_batch(sample.views, images)
+    if replay.priorities is not None:
+        replay.priorities.set(sample.index, errors)
     return 1e3 * (time.process_time() - start)
 
 
@@ -121,3 +168,15 @@ def _exchanges(world: World, episode: int) -> Iterator[tuple[int, Rows, NDArray[
         frame = last_visit if world.config.scenario == 2 else rng.random(last_visit.size) < 0.5
         yield tick, (cells[rows].astype("u2"), actions[rows], rewards[rows]), frame
         first = tick + 1
+
+
+def main() -> int:
+    """The process that is measured: settings as JSON on stdin, figures as JSON on stdout."""
+    parser = argparse.ArgumentParser("deploy.benches.replay", description=__doc__)
+    parser.add_argument("--minibatches", type=int, required=True)
+    json.dump(weigh(json.load(sys.stdin), parser.parse_args().minibatches), sys.stdout)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -290,6 +290,35 @@ def test_exploration_is_addressed(world_of: Callable[..., World], mask: bool) ->
     assert bool(record.blocks.any()) is not mask
 
 
+class Worthy(Script):
+    """A script that says what an action is worth: its number, and 8 or what else it is told is the best."""
+
+    best = 8.0
+
+    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+        return float(action), self.best
+
+
+def test_each_move_is_told_with_its_worth_where_priorities_are_on(world_of: Callable[..., World]) -> None:
+    """Whether exploration chose it or not; numbers that no message takes are the nearest that it does."""
+    values = {"exploration.start": 0.5, "exploration.end": 0.5, "comms.period": 30, "replay.priority": 0.6}
+    for best in (8.0, np.inf):
+        pilot, _, world = learning(world_of, **values)
+        pilot._make_decider = lambda _: policy  # noqa: B023
+        policy = Worthy([STAY] * 1000)
+        policy.best = best
+        pilot.begin(begin(world, 7, world.starts(7)[0], policy=1))
+        pilot.on_policy(Policy(1, b""))
+        record = pilot.advance()
+        assert record is not None and record.values.size == 0  # no move yet
+        pilot.on_map(answer(world, 7, 0, policy=1))
+        record = pilot.advance()
+        assert record is not None and record.tick == 30 and pilot.explored > 5
+        told = record.values.reshape(30, 2)
+        assert told[:, 0].tolist() == record.actions.tolist()
+        assert set(told[:, 1].tolist()) == {min(best, float(np.finfo(np.float32).max))}
+
+
 def test_a_planner_never_explores(team: Callable[..., Team]) -> None:
     values = {"exploration.start": 1.0, "exploration.end": 1.0}
     flown = team(STREET, [0], [[E_, W_] * 20], **values).fly()

@@ -86,6 +86,37 @@ def test_it_chooses_what_the_network_values_most(town: RoadMap, mask: bool, view
     assert len(chosen) > 1
 
 
+@pytest.mark.parametrize("mask", [False, True])
+def test_it_knows_what_actions_are_worth(town: RoadMap, mask: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what it chose by and of what it did not look at yet; the network runs once a sight."""
+    config = build({**TINY, "exploration.mask_blocked": mask})
+    world = World(config, town)
+    net = qnet.build(config, view_shape(config, world.grid))
+    with torch.no_grad():
+        net.out.weight.normal_(generator=torch.Generator().manual_seed(2))
+    observer, runs = Observer(world), [0]
+    decider = NetworkDecider(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
+    q_values = decider.q_values
+
+    def counted() -> Any:
+        runs[0] += 1
+        return q_values()
+
+    monkeypatch.setattr(decider, "q_values", counted)
+    cells = world.start_cells.tolist()[:12]
+    for seed, cell in enumerate(cells):
+        s = sight(world, cell, [k for k in world.grid.target_lists[cell][:2] if k >= 0], seed)
+        o = observer.observe(cell, s.peers, s.u)
+        q = net(torch.tensor(o[None])).detach().numpy()[0]
+        best = max(q[a] for a in (s.allowed if mask else range(9)))
+        chosen = decider.choose(s) if seed % 2 else None  # it does not look where exploration chose
+        for action in range(9):
+            assert decider.worth(s, action) == (pytest.approx(q[action], abs=1e-5), pytest.approx(best, abs=1e-5))
+        if chosen is not None:
+            assert decider.worth(s, chosen)[0] == decider.worth(s, chosen)[1]
+    assert runs == [len(cells)]
+
+
 @pytest.mark.parametrize("favourite", range(9))
 def test_the_mask_takes_the_next_best(town: RoadMap, favourite: int) -> None:
     """In the north-west corner, with a peer in the east: N, W, NW, NE, SW lead off the grid, E is held."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.planners import Sight
+from actors.planners import Sight, Valued
 from actors.witness import Witness, digest
 from tmc.kernel.observation import Observer
 from tmc.kernel.roadmap import RoadMap
@@ -31,6 +31,9 @@ def sight(world_of: Callable[..., World], town: RoadMap) -> Sight:
 class North:
     def choose(self, sight: Sight) -> int:
         return 0
+
+    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+        return float(action), 9.0
 
 
 def record(first: int, tick: int) -> Record:
@@ -70,3 +73,10 @@ def test_one_hash_a_move_and_none_where_chance_chose(observer: Observer, sight: 
     assert said.hashes == [seen, seen, 0, seen]
     decider.choose(replace(sight, tick=4))
     assert witness.testify(record(5, 6)).hashes == [seen, 0]
+
+
+def test_what_a_policy_says_of_its_moves_is_not_a_decision(observer: Observer, sight: Sight) -> None:
+    witness = Witness(observer)
+    watched = witness.watch(North())
+    assert isinstance(watched, Valued) and watched.worth(sight, 4) == (4.0, 9.0)
+    assert witness.testify(record(8, 8)).hashes == [0]

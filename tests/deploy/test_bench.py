@@ -63,7 +63,9 @@ def rows_of(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]
 def test_replay_weighs_and_draws(capsys: pytest.CaptureFixture[str]) -> None:
     rows = rows_of(capsys, "replay", "--minibatches", "3", "--set", "replay.capacity=9000", "--set", "dqn.batch=16")
     assert 20 < rows["9,000 transitions of what is asked"]["value"] < 100
+    assert 8 < rows["9,000 transitions with priorities of what is asked"]["value"] - 46 < 20
     assert rows["a minibatch of 16 of what is asked"]["value"] > 0
+    assert rows["prioritised, and its update of what is asked"]["value"] > 0
     assert rows["inserts of what is asked"]["value"] > 0
 
 

@@ -88,6 +88,27 @@ def test_huber_is_half_the_square_then_linear():
     assert float(dqn.loss(torch.tensor(td), "huber")) == pytest.approx(plain)
 
 
+@pytest.mark.parametrize("kind", ["mse", "huber"])
+def test_a_weight_multiplies_the_loss_of_its_transition(kind):
+    td, weight = [0.5, -1.0, 3.0, -20.0], [1.0, 0.25, 0.0, 0.5]
+    plain = np.mean([w * float(dqn.loss(torch.tensor([e]), kind)) for e, w in zip(td, weight, strict=True)])
+    assert float(dqn.loss(torch.tensor(td), kind, torch.tensor(weight))) == pytest.approx(plain)
+
+
+@pytest.mark.parametrize(("kind", "b"), [("mse", 128), ("mse", 43), ("huber", 128), ("huber", 43)])
+def test_weights_of_one_change_no_bit(kind, b):
+    """But for Huber's of a minibatch whose size is no power of two: torch then divides by it before, not after."""
+    td = torch.randn(b, generator=torch.Generator().manual_seed(b)) * 3
+    results = []
+    for weight in (None, torch.ones(b)):
+        leaf = td.clone().requires_grad_()
+        value = dqn.loss(leaf, kind, weight)
+        value.backward()
+        results.append((value.detach(), leaf.grad))
+    for mine, plain in zip(*results, strict=True):
+        torch.testing.assert_close(mine, plain, atol=0, rtol=1e-6 if (kind, b) == ("huber", 43) else 0)
+
+
 def test_the_gradient_of_the_loss_reaches_the_action_taken_only():
     q = torch.zeros(2, 9, requires_grad=True)
     dqn.loss(dqn.td_error(q, torch.tensor([2, 5]), torch.tensor([1.0, -2.0]))).backward()

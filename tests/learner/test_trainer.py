@@ -1,6 +1,7 @@
 """Algorithm 1's update, its target copy, and the state that a checkpoint needs."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import onnxruntime
@@ -10,7 +11,7 @@ import torch
 from learner import bare, dqn, qnet
 from learner.intake import TrainingError
 from learner.trainer import Trainer, copy_due
-from tmc.kernel.config import build
+from tmc.kernel.config import build, flat
 from tmc.kernel.grid import Grid
 from tmc.kernel.policy import KEY, PolicyCard, card_for
 
@@ -247,7 +248,7 @@ def test_metrics_are_plain_floats(small, trainer_of, minibatch_of):
 def batches_with_repeats(minibatch_of, config, count, **fields):
     """Minibatches in which most transitions come back, in other company, as those of a memory do."""
     pool, rng = minibatch_of(config, 77, b=24, **fields), np.random.Generator(np.random.Philox(5))
-    names = [name for name, value in vars(pool).items() if isinstance(value, np.ndarray)]
+    names = [name for name, value in vars(pool).items() if isinstance(value, np.ndarray) and value.size]
     for number in range(count):
         rows = rng.integers(0, 24, 16)
         again = {name: getattr(pool, name)[rows] for name in names}
@@ -305,3 +306,63 @@ def test_transitions_without_numbers_are_refused(small, trainer_of, minibatch_of
         with pytest.raises(TrainingError, match="not numbered"):
             trainer.update(minibatch_of(trainer.config, index=index))
     assert same(trainer, untouched)
+
+
+# Prioritised minibatches.
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_weights_count_as_in_the_plain_equations(preset, trainer_of, minibatch_of, threads):
+    """One step of plain Adam on the mean of weight times loss, whatever the threads that share it."""
+    config = build({**flat(preset), "replay.priority": 0.6, "training.threads": threads})
+    trainer = trainer_of(config)
+    weight = np.array([1.0, 0.5, 0.1, 0.9, 0.3, 0.7], "<f4")
+    batch = minibatch_of(config, weight=weight)
+    net = qnet.build(config, trainer.shape)
+    o, o_next = torch.tensor(batch.observation), torch.tensor(following(batch))
+    allowed, reward = torch.tensor(batch.allowed), torch.tensor(batch.reward) * config.dqn.reward_scale
+    with torch.no_grad():
+        y = dqn.target(reward, torch.tensor(batch.discount), net(o_next), allowed)  # theta- is theta yet
+    td = dqn.td_error(net(o), torch.tensor(batch.action, dtype=torch.int64), y)
+    losses = [w * dqn.loss(e[None], config.dqn.loss) for w, e in zip(weight.tolist(), td, strict=True)]
+    loss = sum(losses) / 6
+    loss.backward()
+    metrics = trainer.update(batch)
+    assert metrics.loss == pytest.approx(float(loss.detach()), rel=1e-5)
+    plain = torch.cat([p.grad.flatten() for p in net.parameters()])
+    mine = torch.cat([p.grad.flatten() for p in trainer.online.parameters()])
+    torch.testing.assert_close(mine, plain, atol=1e-5 * float(plain.abs().max()), rtol=1e-4)
+
+
+def test_weights_of_one_give_the_same_weights_of_the_network(paper, trainer_of, minibatch_of):
+    plain, weighted = trainer_of(paper), trainer_of(paper)
+    for number in range(3):
+        batch = minibatch_of(paper, number, b=16)
+        assert plain.update(batch) == weighted.update(replace(batch, weight=np.ones(16, "<f4")))
+    assert same(plain, weighted)
+
+
+def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small({"replay.priority": 0.6}))
+    assert [x.size for x in trainer.judged()] == [0, 0]
+    batch = minibatch_of(trainer.config)
+    metrics = trainer.update(batch)
+    index, errors = trainer.judged()
+    assert index.tolist() == batch.index.tolist() and (index.dtype, errors.dtype) == (np.int64, np.float32)
+    assert errors.shape == (6,) and errors.mean() == pytest.approx(metrics.td_abs) and (errors >= 0).all()
+    assert [x.size for x in trainer.judged()] == [0, 0]
+    trainer.update(batch)
+    trainer.forget()  # the numbers begin anew
+    assert [x.size for x in trainer.judged()] == [0, 0]
+
+
+def test_without_priorities_no_errors_are_told(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small())
+    trainer.update(minibatch_of(trainer.config))
+    assert [x.size for x in trainer.judged()] == [0, 0]
+
+
+def test_weights_that_do_not_fit_are_refused(small, trainer_of, minibatch_of):
+    trainer = trainer_of(small())
+    with pytest.raises(TrainingError, match="5 weights: it must have 6, or none"):
+        trainer.update(minibatch_of(trainer.config, weight=np.ones(5, "<f4")))

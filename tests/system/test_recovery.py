@@ -119,9 +119,13 @@ def test_a_flight_goes_on_after_everything_was_killed(
     assert (out / "tmc.mcap").stat() == size
 
 
-def test_training_goes_on_after_everything_was_killed(overfly: Overfly, running: Running, tmp_path: Path) -> None:
+@pytest.mark.parametrize("priority", ["0", "0.6"])
+def test_training_goes_on_after_everything_was_killed(
+    overfly: Overfly, running: Running, tmp_path: Path, priority: str
+) -> None:
     out = tmp_path / "R"
     small = ("--actors", "2", "--ticks", "60", "--episodes", "4", "--set", "replay.learn_start=60")
+    small = (*small, "--set", f"replay.priority={priority}")
     small = (*small, "--set", "dqn.batch=16", "--set", "training.checkpoint_every=20", "--set", "replay.slack=20")
     with begin(tmp_path, "run", "patrol", *small, "--out", str(out)) as run:
         wait_for(lambda: ended(out) >= 1 and list((out / "checkpoints").glob("*.safetensors")), run)

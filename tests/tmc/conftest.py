@@ -47,7 +47,7 @@ class Wanderer:
     """Half of the time towards the middle, where the others are too; otherwise anywhere, blocked or not."""
 
     def __init__(self, world: World) -> None:
-        self.grid = world.grid
+        self.grid, self.masks = world.grid, world.config.exploration.mask_blocked
         self.middle = world.grid.cell(world.grid.rows // 2, world.grid.cols // 2)
 
     def choose(self, sight: Sight) -> int:
@@ -56,6 +56,15 @@ class Wanderer:
         targets = self.grid.target_lists[sight.cell]
         inside = [a for a in range(N_ACTIONS) if targets[a] >= 0]
         return min(inside, key=lambda a: self.grid.chebyshev(targets[a], self.middle))
+
+    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+        q = nine(sight.tick, sight.cell)
+        return q[action], max(q[a] for a in sight.allowed) if self.masks else max(q)
+
+
+def nine(tick: int, cell: int) -> list[float]:
+    """What `Wanderer` takes the nine actions to be worth; any numbers would do."""
+    return [float(np.float32(3 * np.sin(0.7 * tick + 1.3 * cell + 2.1 * a))) for a in range(N_ACTIONS)]
 
 
 class SpyPilot(Pilot):
@@ -324,6 +333,12 @@ def town() -> RoadMap:
 @pytest.fixture(scope="session")
 def toronto() -> RoadMap:
     return load_map("downtown-toronto")
+
+
+@pytest.fixture(scope="session")
+def worth_of() -> Callable[[int, int], list[float]]:
+    """(tick, cell) -> Q of the nine actions, as the UAVs of a mission with a policy have it."""
+    return nine
 
 
 @pytest.fixture(scope="session")

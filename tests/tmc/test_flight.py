@@ -19,7 +19,7 @@ from tmc.kernel.observation import Observer
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
-from tmc.replay import Replay
+from tmc.replay import Replay, Ring
 from tmc.wire.messages import Record
 
 MOVES = [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1), (0, 0)]
@@ -421,7 +421,7 @@ def state(flight: Flight) -> bytes:
     """Everything that a flight and its replay hold."""
     own = {k: v for k, v in vars(flight).items() if k not in {"world", "reward", "replay"}}
     memory = {k: v for k, v in vars(flight.replay).items() if k not in {"world", "observer"}}
-    return pickle.dumps((own, {k: vars(v) if hasattr(v, "data") else v for k, v in memory.items()}))
+    return pickle.dumps((own, {k: vars(v) if isinstance(v, Ring) else v for k, v in memory.items()}))
 
 
 @pytest.mark.parametrize("why", list(MALFORMED))

@@ -137,6 +137,21 @@ def check_uncertainty(mission: Losing, cells: dict[tuple[int, int, int], int]) -
                 assert value == pytest.approx(sum(1 - math.exp(-0.01 * (t - tau)) for tau in last.values()), abs=1e-9)
 
 
+def test_by_priorities_nothing_of_a_lost_uav_is_drawn_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what is left, everything is; planners tell no values, so all are as likely."""
+    monkeypatch.setattr("actors.pilot.STINT", 1)
+    mission = Losing(20, **{"scenario": 2, "comms.phase": "staggered", "replay.priority": 0.6}).fly()
+    replay = mission.step.station.replay
+    place = np.arange(replay.starts_in)
+    there = {(p, i) for p, i in zip(*np.nonzero(replay.cells[replay.ends[place]] != GONE), strict=True)}
+    drawn: set[tuple[int, int]] = set()
+    for number in range(4):
+        sample = replay.sample(number, 4000)
+        assert (sample.weight == 1.0).all()
+        drawn |= set(zip(*np.divmod(sample.index, N), strict=True))
+    assert drawn == there and len(there) < place.size * N
+
+
 @pytest.mark.parametrize("dies", [20, 41])
 def test_what_is_learned_from_is_what_was_seen(losing: Callable[[int], Losing], dies: int) -> None:
     """Bit for bit, also around the loss; of a UAV that is gone, nothing is drawn."""
@@ -149,6 +164,25 @@ def test_what_is_learned_from_is_what_was_seen(losing: Callable[[int], Losing], 
     for b, key in enumerate(zip(episodes, ticks, sample.uav.tolist(), strict=True)):
         assert (images[b] == mission.seen[key]).all(), key
     assert {e for e, t, i in zip(episodes, ticks, sample.uav, strict=True) if i == LOST} >= {1, 3}
+
+
+@pytest.mark.parametrize("priority", [0.0, 0.6])
+def test_nothing_is_drawn_of_ticks_in_which_nobody_is_left(priority: float) -> None:
+    values = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
+    world = World(build({**values, "replay.learn_start": 1, "replay.priority": priority}))
+    step = LockStep(world, None, lambda _: None)
+    for i in range(N):
+        for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
+            step.fleet.deliver(uav, reply)
+    while step.fleet.pilots[0].t < 25:
+        step.fleet.step()
+    step.station.tick(1000.0)
+    assert all(member.life < 0 for member in step.station.roster)
+    step.station.settle()
+    replay = step.station.replay
+    assert replay.rows_in == 91
+    sample = replay.sample(1, 2000)
+    assert replay.tick[sample.row].max() < 25 and (sample.views.cells < world.grid.size).all()
 
 
 def test_a_zombie_is_not_listened_to_and_is_back_with_the_next_episode() -> None:

@@ -77,6 +77,7 @@ def cases(draw: st.DrawFn) -> Case:
         "replay.capacity": size * draw(st.sampled_from([1, ticks, 2 * ticks + 1, 1000])),
         "replay.learn_start": size,
         "replay.slack": draw(st.sampled_from([1, 4])),
+        "replay.priority": draw(st.sampled_from([0.0, 0.0, 0.6])),
     }
     loses = draw(st.sampled_from([0, 0, 1]))
     return Case(values, learning, draw(st.sampled_from([0.0, 0.02])), loses, draw(st.integers(0, 2**16)))

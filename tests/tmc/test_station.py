@@ -16,6 +16,7 @@ from tmc.kernel.config import Config, build, flat
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
+from tmc.replay import Ring
 from tmc.roster import LEARNER, uav_name
 from tmc.station import Station
 from tmc.wire import messages as m
@@ -79,7 +80,7 @@ def state(station: Station) -> bytes:
     out = {"out", "rejected", "world", "config", "observer", "reward", "replay", "flight", "roster"}
     parts: list[Any] = [{k: v for k, v in vars(station).items() if k not in out}]
     parts += [(member.life, member.sequence, member.answer) for member in station.roster]
-    parts.append({k: v.data for k, v in vars(station.replay).items() if hasattr(v, "data")})
+    parts.append({k: v.data for k, v in vars(station.replay).items() if isinstance(v, Ring)})
     if station.flight is not None:
         parts.append({k: v for k, v in vars(station.flight).items() if k not in {"world", "reward", "replay"}})
     return pickle.dumps(parts)
@@ -426,6 +427,13 @@ def test_a_repeat_of_a_held_answer_does_not_get_around_the_limiter(learning: Lea
 def test_at_most_eight_requests_are_in_flight(learning: Learning) -> None:
     assert learning.ask(*range(8)) == []
     rejects(learning.station, LEARNER, m.SampleRequest(8), "refused", "more than 8")
+
+
+def test_errors_that_cannot_be_are_refused(learning: Learning, station_of: Callable[..., Station]) -> None:
+    index, errors = np.arange(4), np.ones(3, "<f4")
+    on = Learning(station_of({**LEARN, "replay.priority": 0.6}, learning=True)).station
+    rejects(on, LEARNER, m.SampleRequest(1, index, errors), "refused", "an error for each transition")
+    rejects(learning.station, LEARNER, m.SampleRequest(1, index[:3], errors), "refused", "replay.priority is 0")
 
 
 def test_only_the_learner_learns(learning: Learning, flying: Station) -> None:

@@ -124,6 +124,12 @@ class Replay:
     capacity: int = _s(100_000, "transitions that the replay memory holds", "transitions", "Table I")
     learn_start: int = _s(128, "transitions before the first minibatch", "transitions", "left open: b")
     updates_per_tick: float = _s(1.0, "minibatches a tick of the team", "updates/tick", "Algorithm 1: one")
+    priority: float = _s(
+        0.0, "alpha: a transition is drawn in proportion to |TD error|^alpha; 0: all alike", source="eq. (8): all alike"
+    )
+    correction: float = _s(
+        0.4, "beta: weights in the loss that make up for it, in full at 1", source="Schaul et al. 2016, Sec. 3.4"
+    )
     slack: int = _s(200, "how far ticks and updates may drift apart before the limiter holds one back", "ticks")
 
 

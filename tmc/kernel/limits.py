@@ -40,6 +40,8 @@ RANGES: tuple[tuple[str, float, float], ...] = (
     ("replay.capacity", 1, 1_000_000_000),
     ("replay.learn_start", 1, 1_000_000_000),
     ("replay.updates_per_tick", 0.0, 1000.0),
+    ("replay.priority", 0.0, 1.0),
+    ("replay.correction", 0.0, 1.0),
     ("replay.slack", 1, 1_000_000),
     ("training.episodes", 1, 10_000_000),
     ("training.ticks", 1, 60_000),

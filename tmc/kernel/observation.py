@@ -55,6 +55,10 @@ class Observer:
         self._window = window.astype(np.int64)
         terrain = np.where(world.map.blocked, -1.0, np.where(world.map.road, 1.0, 0.0))
         self._terrain = np.append(terrain, -1.0).astype(np.float32)[self._window]
+        blank = np.stack([np.zeros_like(self._terrain[0]), self._terrain[0], np.zeros_like(self._terrain[0])])
+        self._blank = blank, np.ascontiguousarray(blank.T).T
+        """An image of nothing but the terrain, (3, K); and the same with the channels last in memory: what lies alike
+        is copied whole."""
         place = np.append(np.where(world.law.index < 0, R, world.law.index), R)
         self._place = place[self._window].astype(np.int64)
         self._monitored = world.law.cells.astype(np.int64)
@@ -122,13 +126,12 @@ class Observer:
         """
         B, cells, u = views.cells.size, views.cells.astype(np.int64), views.u
         drawn = np.empty((B, *self.shape), np.float32) if images is None else images
-        drawn[...] = 0.0
         out = drawn.reshape(B, 3, -1)
+        out[...] = self._blank[out.strides[1] < out.strides[2]] if self._whole else 0.0
         batch, peer = np.nonzero(views.peers < self.grid.size)
         self._mark_batch(out, batch, cells[batch], views.peers[batch, peer].astype(np.int64), PEER)
         self._mark_batch(out, np.arange(B), cells, cells, EGO)
         if self._whole:  # only the monitored cells are written: a gather of all of them takes three times as long
-            out[:, 1] = self._terrain[0]
             out[:, 2][:, self._monitored] = u
         else:
             padded = np.zeros((B, u.shape[1] + 1), np.float32)

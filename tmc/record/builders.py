@@ -26,7 +26,10 @@ NUMERIC = {"|u1": "UINT8", "<u4": "UINT32", "<f4": "FLOAT32"}
 _KINDS = {name: kind for kind, name in NUMERIC.items()}
 
 _NUMBERS = ("uav", "life", "sequence", "episode", "first", "tick", "version", "policy")
-_ARRAYS = {"cells": "<u2", "actions": "u1", "blocks": "u1", "rewards": "<f4", "seen_tick": "<u2", "seen_cell": "<u2"}
+_ARRAYS = {
+    "cells": "<u2", "actions": "u1", "blocks": "u1", "rewards": "<f4", "seen_tick": "<u2", "seen_cell": "<u2",
+    "values": "<f4",
+}  # fmt: skip
 _CODES = {"<u2": "H", "u1": "B", "<f4": "f"}
 
 

@@ -20,7 +20,7 @@ PACKAGE = "overfly"
 TYPES: dict[str, str] = {
     "FlightRecord": "uint32 uav, uint64 life, uint64 sequence, uint32 episode, uint32 first, uint32 tick, "
     "uint64 version, uint64 policy, uint32* cells, uint32* actions, uint32* blocks, float* rewards, "
-    "uint32* seen_tick, uint32* seen_cell",
+    "uint32* seen_tick, uint32* seen_cell, float* values",
     "Sync": "uint32 episode, uint32 tick, uint64 version, uint64 policy, uint32* uavs, double believed",
     "Episode": "uint32 episode, string phase, uint32* starts, uint32 ticks, double uncertainty, "
     "double uncertainty_per_cell, double* reward, uint64 blocked_grid, uint64 blocked_obstacle, uint64 blocked_uav, "

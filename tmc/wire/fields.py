@@ -40,7 +40,9 @@ class Rule:
         return np.dtype(self.dtype)
 
 
-def _field(rule: Rule, default: Any = dataclasses.MISSING) -> Any:
+def _field(rule: Rule, default: Any = dataclasses.MISSING, *, empty: bool = False) -> Any:
+    if empty:
+        return dataclasses.field(default_factory=lambda: np.zeros(0, rule.dtype), metadata={"rule": rule})
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"rule": rule})
     return dataclasses.field(default=default, metadata={"rule": rule})
@@ -71,14 +73,17 @@ def blob(longest: int) -> Any:
     return _field(Rule("bytes", 0, longest))
 
 
-def array(dtype: str, longest: int) -> Any:
-    """A short one-dimensional array, carried in the header as little-endian bytes; finite if it holds floats."""
-    return _field(Rule("array", 0, longest, dtype=dtype))
+def array(dtype: str, longest: int, *, empty: bool = False) -> Any:
+    """A short one-dimensional array, carried in the header as little-endian bytes; finite if it holds floats.
+
+    `empty`: whoever makes the message without it means an empty one.
+    """
+    return _field(Rule("array", 0, longest, dtype=dtype), empty=empty)
 
 
-def tensor(dtype: str, ndim: int) -> Any:
-    """A large array in a frame of its own, so that neither side copies it."""
-    return _field(Rule("tensor", 0, FRAME_LIMIT // np.dtype(dtype).itemsize, dtype=dtype, ndim=ndim))
+def tensor(dtype: str, ndim: int, *, empty: bool = False) -> Any:
+    """A large array in a frame of its own, so that neither side copies it. `empty`, of one axis only: as in `array`."""
+    return _field(Rule("tensor", 0, FRAME_LIMIT // np.dtype(dtype).itemsize, dtype=dtype, ndim=ndim), empty=empty)
 
 
 def rules(cls: type) -> dict[str, Rule]:

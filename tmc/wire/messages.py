@@ -81,7 +81,9 @@ class Record(Message):
 
     `cells` has one entry a tick. `actions`, `blocks` (why a move was blocked, 0: it was not) and `rewards` (as the UAV
     reckons them by its own map) have one entry a move, so one less than `cells` when the record starts at tick 0.
-    `seen_tick`, `seen_cell`: peers sensed, one entry a sighting. `version`: the map that the UAV flew by.
+    `seen_tick`, `seen_cell`: peers sensed, one entry a sighting. `version`: the map that the UAV flew by. `values`:
+    where a policy flies and `replay.priority` is not 0, two entries a move, Q(o_t, a_t) and max_a Q(o_t, a) over the
+    actions that the UAV may choose; else empty.
     """
 
     uav: int = f.integer(0, 65_535)
@@ -98,6 +100,7 @@ class Record(Message):
     rewards: Array = f.array("<f4", 65_535)
     seen_tick: Array = f.array("<u2", 1_000_000)
     seen_cell: Array = f.array("<u2", 1_000_000)
+    values: Array = f.array("<f4", 131_070, empty=True)
 
 
 @dataclass(frozen=True)
@@ -156,9 +159,15 @@ class Policy(Message):
 
 @dataclass(frozen=True)
 class SampleRequest(Message):
-    """One minibatch, please. `request` comes back in the answer."""
+    """One minibatch, please. `request` comes back in the answer.
+
+    `index`, `errors`: the transitions of a minibatch that was just learned from, by number, and |Q - y| of each, which
+    is their priority from now on; both empty before the first one and where `replay.priority` is 0.
+    """
 
     request: int = f.integer(0, 2**62)
+    index: Array = f.array("<i8", 65_536, empty=True)
+    errors: Array = f.array("<f4", 65_536, empty=True)
 
 
 @dataclass(frozen=True)
@@ -168,7 +177,8 @@ class Minibatch(Message):
     `cells` (2b,), `peers` (2b, P), `u` (2b, R): the fields of `tmc.kernel.observation.Views`, first those of o_t, then
     those of o_{t+n}. `reward`: the n-step sum, unscaled. `discount`: gamma^n. `allowed`: (b, 9), 0 for the actions that
     a UAV in o_{t+n} would not choose. `episodes`: finished so far. `index`: a number of each transition, which no
-    other has before the TMC's next `Welcome`.
+    other has before the TMC's next `Welcome`. `weight`: of each transition in the loss; empty where all count alike,
+    that is where `replay.priority` is 0.
     """
 
     request: int = f.integer(0, 2**62)
@@ -182,6 +192,7 @@ class Minibatch(Message):
     discount: Array = f.tensor("<f4", 1)
     allowed: Array = f.tensor("u1", 2)
     index: Array = f.tensor("<i8", 1)
+    weight: Array = f.tensor("<f4", 1, empty=True)
 
 
 @dataclass(frozen=True)

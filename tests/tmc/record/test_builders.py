@@ -25,6 +25,7 @@ def records(draw):
         cells=some("<u2"), actions=some("u1"), blocks=some("u1"),
         rewards=some("<f4", elements=st.floats(width=32, allow_nan=False, allow_infinity=False)),
         seen_tick=some("<u2"), seen_cell=some("<u2"),
+        values=some("<f4", elements=st.floats(width=32, allow_nan=False, allow_infinity=False)),
     )  # fmt: skip
 
 

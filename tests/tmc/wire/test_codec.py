@@ -21,6 +21,7 @@ Same = Callable[[Message, Message], bool]
 BATCH = Minibatch(
     1, 0, 0, np.zeros(4, "<u2"), np.zeros((4, 1), "<u2"), np.zeros((4, 5), "<f4"),
     np.zeros(2, "u1"), np.zeros(2, "<f4"), np.zeros(2, "<f4"), np.ones((2, 9), "u1"), np.arange(2),
+    np.ones(2, "<f4"),
 )  # fmt: skip
 ANYTHING = st.recursive(
     st.none()
