@@ -200,8 +200,9 @@ def misfit(e: Evidence, m: Any) -> str:
         return f"there is no UAV {m.uav} in a team of {e.N}"
     if not m.first <= m.tick <= e.T:
         return f"ticks {m.first}..{m.tick} are none of an episode of {e.T}"
-    lengths = [len(m.cells), len(m.actions), len(m.blocks), len(m.rewards), len(m.seen_tick)]
-    if lengths != [m.tick - m.first + 1, moves, moves, moves, len(m.seen_cell)]:
+    valued = bool(e.world.config.replay.priority) and e.world.config.team.pilot == "policy"
+    lengths = [len(m.cells), len(m.actions), len(m.blocks), len(m.rewards), len(m.seen_tick), len(m.values)]
+    if lengths != [m.tick - m.first + 1, moves, moves, moves, len(m.seen_cell), 2 * moves * valued]:
         return "its arrays do not match its ticks"
     if max(m.cells) >= size or max(m.seen_cell, default=0) >= size:
         return "a cell is off the grid"
