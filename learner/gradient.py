@@ -40,7 +40,9 @@ class Gradient:
         if n == 1:
             return shares[0]
         gradients, q, losses = zip(*shares, strict=True)
-        total = [torch.stack(same).sum(0) for same in zip(*gradients, strict=True)]
+        total = gradients[0]
+        for others in gradients[1:]:
+            torch._foreach_add_(total, others)
         return total, torch.cat(q), torch.stack(losses).sum()
 
     def _share(self, o: Tensor, action: Tensor, y: Tensor, weight: Tensor | None, b: int) -> Share:

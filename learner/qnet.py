@@ -40,7 +40,7 @@ class QNet(nn.Module):
     def forward(self, o: Tensor) -> Tensor:
         x = o
         for conv in self.convs:
-            x = torch.relu(conv(x))
+            x = torch.relu_(conv(x))  # in place: what does not fit into the caches costs most
         if x.requires_grad and not x.is_contiguous():
             x.register_hook(as_filters_like)  # type: ignore[no-untyped-call]
         x = x.flatten(1)
