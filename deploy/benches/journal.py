@@ -53,13 +53,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dir", type=Path, default=Path(), help="folder on the disk to measure (default: this one)")
     parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
     parser.add_argument("--seconds", type=float, default=2.0, metavar="S", help="of each stretch (default: 2)")
+    parser.add_argument(
+        "--pace", type=float, default=0.0, metavar="P",
+        help="flight records a second that the share of a core is told for (default: those of a flight; a training has 60)",
+    )  # fmt: skip
     settings.add_options(parser)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Fly once in processes, once in lock step, and journal that again and again; one row a figure."""
-    if args.repeats < 1 or args.seconds <= 0:
-        raise ConfigError("--repeats must be 1 or more, and --seconds more than 0")
+    if args.repeats < 1 or not args.seconds > 0 or not args.pace >= 0:
+        raise ConfigError("--repeats must be 1 or more, --seconds more than 0, and --pace 0 or more")
     if not args.dir.is_dir():
         raise ConfigError(f"--dir {args.dir} is no folder: choose one on the disk that runs are written to")
     pilot = who.resolve("planner:greedy")
@@ -72,7 +76,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
         rate = rollout.fly_processes(world, None, flown, table=True, weigh=False).rate
         _say(f"N = {world.config.team.size}: flown by processes, {rate:,.0f} UAV steps a second")
         outboxes = fly(world)
-        pace = rate * sum(map(records_in, outboxes)) / steps_of(world.config)
+        pace = args.pace or rate * sum(map(records_in, outboxes)) / steps_of(world.config)
         rows = list(_speed(world, outboxes, pace, folder, args))
         rows.append(Row("journal", "fsync", 1e3 * median(fsyncs(world, outboxes, folder)), "ms, median"))
         return rows + list(_sizes(world, flown, folder))
