@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=2.0, metavar="S", help="of each stretch (default: 2)")
     parser.add_argument(
         "--pace", type=float, default=0.0, metavar="P",
-        help="flight records a second that the share of a core is told for (default: those of a flight; a training has 60)",
+        help="flight records a second for the share of a core (default: those of a flight; a training has 60)",
     )  # fmt: skip
     settings.add_options(parser)
 
