@@ -64,6 +64,10 @@ class LockStep:
         pilots = [pilot(i) for i in range(config.team.size)]
         self.fleet = Fleet(pilots, self._exchange)
         self._minibatches: list[m.Minibatch] = []
+        if trainer is not None:
+            from learner.intake import Intake  # noqa: PLC0415  torch only where something is learned
+
+            self._intake = Intake(observer)
 
     def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
         if self.testify is not None and isinstance(message, m.Record):
@@ -100,13 +104,8 @@ class LockStep:
     def _learn(self) -> bool:
         """Train on every minibatch that the limiter lets through; True when there was one."""
         trainer, learned = self.trainer, False
-        if trainer is None or not self._minibatches:
-            return False
-        from learner.intake import Intake  # noqa: PLC0415  torch only where something is learned
-
-        intake = Intake(self.station.observer)
-        while self._minibatches:
-            metrics = trainer.update(intake.read(self._minibatches.pop(0)))
+        while trainer is not None and self._minibatches:
+            metrics = trainer.update(self._intake.read(self._minibatches.pop(0)))
             learned = True
             if metrics.updates % self.world.config.training.push_every == 0:
                 self._push(metrics.loss)

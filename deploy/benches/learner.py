@@ -20,10 +20,9 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
-from actors.tracks import create_table
 from deploy import plan, settings
 from deploy.benches.replay import fill
-from deploy.benches.rollout import weigh_all
+from deploy.benches.rollout import started, weigh_all
 from deploy.benches.row import Row
 from deploy.mission import check
 from deploy.progress import Observer
@@ -128,15 +127,9 @@ def bare_loop(config: Config, seconds: float, name: str) -> float:
 def fly(world: World, seconds: float, out: Path) -> Learned:
     """A mission in processes of its own; time is taken once the memory is full and theta- has changed."""
     config = world.config
-    (out / "config.json").write_text(json.dumps(flat(config)))
     warm = config.replay.capacity // config.team.size + config.dqn.target_updates
-    mission = plan.make(config, out, policy=None)
-    supervisor = Supervisor(mission, out, config.training.threads, say)
-    observer = Observer(mission.endpoint)
-    try:
-        create_table(mission.tracks, config.team.size, config.training.ticks)
-        begun = time.monotonic()
-        supervisor.start()
+    begun = time.monotonic()
+    with started(config, None, out) as (supervisor, observer):
         first, _ = _wait(supervisor, observer, updates=1)
         began, since = _wait(supervisor, observer, updates=warm)
         cpu = _cpu(supervisor.pids())
@@ -144,10 +137,6 @@ def fly(world: World, seconds: float, out: Path) -> Learned:
         span, updates = ended - began, until.updates - since.updates
         spent = {role: 1e3 * (s - cpu[role]) / updates for role, s in _cpu(supervisor.pids()).items()}
         memory = weigh_all(supervisor.pids())
-    finally:
-        observer.close()
-        supervisor.stop()
-        supervisor.close()
     ticks = (until.ticks - since.ticks) / span
     total = memory.total if memory else None
     return Learned(updates / span, ticks, first - begun, total, _idle(out, seconds), spent)
@@ -170,7 +159,7 @@ def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
     spent = dict.fromkeys(("learner", "tmc", "uavs"), 0.0)
     for name, pid in pids.items():
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        role = name if name in spent else "uavs"  # with the process that forks them
+        role = next((role for role in ("tmc", "learner") if name.endswith(role)), "uavs")  # with what forks them
         spent[role] += (int(fields[11]) + int(fields[12])) / TICK
     return spent
 

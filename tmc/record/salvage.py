@@ -146,7 +146,8 @@ class _Scan:
 
     def _header(self, at: int, body: bytes, _dry: bool) -> None:
         header = Header.read(ReadDataStream(BytesIO(body)))
-        if at != len(MAGIC) or 8 + len(header.profile.encode()) + len(header.library.encode()) != len(body):
+        texts = vars(header).values()  # its profile, and the library that wrote it, each behind its length
+        if at != len(MAGIC) or sum(4 + len(text.encode()) for text in texts) != len(body):
             raise UnsoundError("its header is damaged")
         self.found.profile, self.numbered = header.profile, header.profile == PROFILE
 
