@@ -15,7 +15,7 @@ from tmc.roster import LEARNER, uav_name
 from tmc.station import Station
 from tmc.wire import sockets
 from tmc.wire.codec import CodecError, decode
-from tmc.wire.messages import Begin, Bye, End, Map, PolicyPush
+from tmc.wire.messages import Begin, Bye, End, Lost, Map, Message, PolicyPush
 
 BURST = 64
 """Messages taken from one socket before the other has its turn."""
@@ -30,6 +30,15 @@ REUNION = 3.0
 LEAD = 100
 """Ticks by which answers are ahead of the journal at most, in a training. So a TMC that was started again knows up to
 which tick its last life may have answered: up to there it names the policy that that one named."""
+
+
+def binds(message: Message) -> bool:
+    """Whether the UAVs that are told this act on it for good, so that no TMC may come back without it.
+
+    With a new episode they forget where they were in the last one, which a new process that had to fly the last one's
+    end would ask them; and those who are told of a loss no longer look out for who is lost.
+    """
+    return isinstance(message, Lost) or (isinstance(message, Begin) and message.shipped < 0)
 
 
 class Service:
@@ -78,9 +87,9 @@ class Service:
         return False
 
     def _patience(self) -> int:
-        """Milliseconds to wait for a message."""
+        """Milliseconds to wait for a message; not so long that a silence would be seen late."""
         due = self.journal.due if self._unsettled is None else self._unsettled + REST - time.monotonic()
-        return 100 if due is None else max(0, math.ceil(1000 * due))
+        return 100 if due is None else min(100, max(0, math.ceil(1000 * due)))
 
     def _settle(self) -> None:
         """The book-keeping that nobody waits for, and a group commit where one is due; only then are records
@@ -177,22 +186,25 @@ class Service:
         if self._unsettled is None and (out.entries or out.notes):
             self._unsettled = time.monotonic()
         sends = out.take_sends()
-        self._secure([(name, message) for name, message in sends if isinstance(message, Begin | Map)])
+        self._secure(sends)
         for name, message in sends:
             # Who was not heard yet may have been connected to an earlier life of this process.
             sock, identity = self._where.get(name) or (self.feed if name == LEARNER else self.sync, name.encode())
             sockets.send(sock, message, identity)
 
-    def _secure(self, answers: list[tuple[str, Begin | Map]]) -> None:
-        """Commit first what must not be lost once these are sent: that a UAV was told to fly another policy.
+    def _secure(self, sends: list[tuple[str, Message]]) -> None:
+        """Commit first what must not be lost once these are sent: see `binds`, and that a UAV was told to fly another
+        policy.
 
         Should the TMC and that UAV be killed, the UAV's next process must be told the same, for peers may have seen
         where the last one went.
         """
+        answers = [(name, message) for name, message in sends if isinstance(message, Begin | Map)]
         told = {name: answer.policy for name, answer in answers}
         self._answered = max([self._answered, *(self._when(a.episode, a.tick) for _, a in answers)])
         ahead = self.station.learning and self._answered > self._committed + LEAD
-        if ahead or any(self._flies.get(name, 0) != policy for name, policy in told.items()):
+        changes = any(self._flies.get(name, 0) != policy for name, policy in told.items())
+        if ahead or changes or any(binds(message) for _, message in sends):
             self._write()
             self._commit()
         self._flies |= told

@@ -1,4 +1,4 @@
-"""The TMC's process, killed before a group commit: what it told a UAV to fly, it tells the UAV's next process too."""
+"""The TMC's process, killed before a group commit: what it told UAVs for good, its next life knows too."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from tmc.kernel.config import build, flat
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
+from tmc.record.reader import Log
 from tmc.recovery import recover
 from tmc.roster import LEARNER
 from tmc.service import LEAD
@@ -72,7 +73,8 @@ class Uav:
     def __init__(self, client: Client, world: World, life: int) -> None:
         self.client = client
         tracks = TableTracks(TrackTable(1, world.config.training.ticks), 0)
-        self.pilot = Pilot(world, 0, life, tracks, Observer(world), lambda _: Hovers(), None)
+        planner = None if world.config.team.pilot == "policy" else Hovers()
+        self.pilot = Pilot(world, 0, life, tracks, Observer(world), lambda _: Hovers(), planner)
         client.say(m.Hello("uav", 0, life))
         self.begin = client.hear(m.Begin)
         self._obey(self.pilot.begin(self.begin))
@@ -190,3 +192,28 @@ def test_answers_are_not_far_ahead_of_what_is_committed(
     assert left is not None
     recover(station, left, 0.0)
     assert station.flight is not None and answer.tick - LEAD <= station.flight.reported[0] < answer.tick
+
+
+def test_an_episode_is_committed_before_the_next_one_begins(client: Callable[[str], Client], tmp_path: Path) -> None:
+    """Nobody could tell a process that flew its end again where the others were."""
+    short = World(build({**VALUES, "training.ticks": 20, "training.episodes": 2, "team.pilot": "planner:greedy"}))
+    with killed_in_the_end(short, tmp_path):
+        uav = Uav(client("uav-000"), short, 1)
+        while uav.exchange().tick < 20:
+            pass
+        assert uav.client.hear(m.Begin).episode == 2
+    left, station = journal_in(tmp_path), Station(short, "run", learning=False)
+    assert left is not None
+    recover(station, left, 0.0)
+    assert station.episodes == 1
+
+
+def test_a_loss_is_committed_before_anybody_is_told(client: Callable[[str], Client], tmp_path: Path) -> None:
+    silent = World(build({**VALUES, "comms.lost_after": 1.0, "team.pilot": "planner:greedy"}))
+    with killed_in_the_end(silent, tmp_path):
+        uav = client("uav-000")
+        uav.say(m.Hello("uav", 0, 1))
+        uav.hear(m.Lost)
+    left = journal_in(tmp_path)
+    assert left is not None
+    assert [entry.message.uav for entry in Log(left).entries(("/tmc/lost",))] == [0]
