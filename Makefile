@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN ?= runs/demo-$(shell date -u +%Y%m%d-%H%M%S)
 
-.PHONY: demo test check lint clean
+.PHONY: demo test explore check lint clean
 
 # The main job: three UAV processes, the TMC and the learner on downtown Toronto; then the policy against the baselines.
 demo: $(VENV)/.run
@@ -13,6 +13,10 @@ demo: $(VENV)/.run
 
 test: $(VENV)/.dev $(VENV)/.readers
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+# The properties with examples that nobody has seen yet. A failure names the example: make it a test of its own.
+explore: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m hypothesis --hypothesis-profile explore
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .

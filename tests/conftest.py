@@ -1,5 +1,6 @@
 """For all tests: machines are shared and noisy, so no example of a property has a deadline; pytest's time-out holds.
-And what several tests need and none changes is made once, by the first worker that needs it.
+The examples are the same in every run, so that what fails was broken by the change at hand; `make explore` draws new
+ones. And what several tests need and none changes is made once, by the first worker that needs it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from hypothesis import settings
 
 from tests.command import overfly
 
-settings.register_profile("overfly", deadline=None)
+settings.register_profile("overfly", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None, derandomize=False)
 settings.load_profile("overfly")
 
 Once = Callable[[str, Callable[[Path], object]], Path]
