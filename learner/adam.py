@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.adam import adam
 
 BETAS, EPS = (0.9, 0.999), 1e-8
@@ -31,10 +31,19 @@ class Adam:
     @torch.no_grad()
     def step(self) -> None:
         """One step along the gradients; a weight without one stays as it is."""
-        moved = [(p, p.grad, self.state[p]) for p in self.params if p.grad is not None]
+        moved = [(p, laid_like(p, p.grad), self.state[p]) for p in self.params if p.grad is not None]
         params, grads, states = ([*column] for column in zip(*moved, strict=True))
         first, second, steps = ([s[key] for s in states] for key in ("exp_avg", "exp_avg_sq", "step"))
         adam(
             params, grads, first, second, [], steps, fused=True, amsgrad=False, beta1=BETAS[0], beta2=BETAS[1],
             lr=self.lr, weight_decay=0.0, eps=EPS, maximize=False,
         )  # fmt: skip
+
+
+def laid_like(p: Tensor, gradient: Tensor) -> Tensor:
+    """The same gradient, lying in memory as its weight does.
+
+    torch's kernel goes through both as they lie. Filters have their channels last: with a gradient that has them first,
+    each weight would take the step of another one, and nothing would say so.
+    """
+    return gradient if gradient.stride() == p.stride() else torch.empty_like(p).copy_(gradient)

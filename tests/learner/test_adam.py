@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor, nn
 
@@ -22,10 +23,13 @@ def weights() -> list[nn.Parameter]:
 
 
 def gradients(p: Tensor, seed: int) -> Tensor:
-    return torch.randn(p.shape, generator=torch.Generator().manual_seed(seed))
+    """Lying in memory as the weight does, which torch takes for granted."""
+    return torch.empty_like(p).copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(seed)))
 
 
-def test_every_step_is_that_of_torch() -> None:
+@pytest.mark.parametrize("layout", [torch.preserve_format, torch.contiguous_format])
+def test_every_step_is_that_of_torch(layout: torch.memory_format) -> None:
+    """However our gradients lie in memory."""
     mine, theirs = weights(), weights()
     adam, reference = Adam(mine, 1e-3), torch.optim.Adam(theirs, lr=1e-3, fused=True)
     for n in range(20):
@@ -33,7 +37,9 @@ def test_every_step_is_that_of_torch() -> None:
             optimizer.zero_grad()
             for i, p in enumerate(params[:2]):
                 assert p.grad is None
-                p.grad = gradients(p, 10 * n + i)
+                p.grad = gradients(p, 10 * n + i).clone(
+                    memory_format=layout if params is mine else torch.preserve_format
+                )
             optimizer.step()
         assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
     for a, b in zip(mine[:2], theirs[:2], strict=True):

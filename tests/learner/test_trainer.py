@@ -54,8 +54,9 @@ def plain_updates(config, shape, batches):
     return net
 
 
-def test_updates_are_plain_adam_on_the_plain_equations(preset, trainer_of, minibatch_of):
-    trainer = trainer_of(preset)
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_updates_are_plain_adam_on_the_plain_equations(preset, trainer_of, minibatch_of, threads):
+    trainer = trainer_of(build({**flat(preset), "training.threads": threads}))
     batches = [minibatch_of(preset, n) for n in range(4)]
     for batch in batches:
         trainer.update(batch)
