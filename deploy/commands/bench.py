@@ -8,6 +8,7 @@ import json
 import sys
 from dataclasses import asdict, dataclass
 
+from deploy.benches import cores
 from deploy.benches.row import machine, text
 
 
@@ -46,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Measure, then print the table, or a line of JSON a figure with the machine and the versions."""
     facts = machine()
+    before = cores.worth()
     rows = importlib.import_module(next(b.module for b in BENCHES if b.name == args.bench)).measure(args)
+    facts["cores_worth"] = [before, cores.worth()]
     if args.json:
         for row in rows:
             print(json.dumps(asdict(row) | facts))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from deploy import cli
-from deploy.benches import rollout
+from deploy.benches import cores, rollout
 from deploy.benches.row import Row, text
 
 TINY = ("bench", "rollout", "--actors", "1,2", "--ticks", "50", "--repeats", "1")
@@ -33,6 +34,7 @@ def test_rollout_prints_a_line_of_json_a_figure(capsys: pytest.CaptureFixture[st
         assert {"bench", "case", "value", "unit", "reference", "ratio", "platform", "cores", "load", "numpy"} <= set(
             row
         )
+        assert len(row["cores_worth"]) == 2
 
 
 def test_journal_prints_a_line_of_json_a_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,6 +143,16 @@ def test_memory_is_what_the_system_says() -> None:
     assert set(memory.roles) == {"uavs", "supervisor"} and sum(memory.roles.values()) == memory.total
     assert rollout.own() == pytest.approx(memory.roles["supervisor"], rel=0.5)
     assert rollout.weigh_all({"uav-000": 2**22 + 1}) is None
+
+
+def test_what_the_cores_are_worth_is_counted_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    worth = cores.worth()
+    assert worth is None or worth > 0.0
+    assert cores.main([str(time.monotonic() + 0.2), "1"]) == 0
+    alone, together = json.loads(capsys.readouterr().out)
+    assert alone > 0 and together > 0
+    assert cores.main([str(time.monotonic() - 1.0), "1"]) == 0
+    assert capsys.readouterr().out == "null\n", "it came too late, and counted all the same"
 
 
 def test_the_table_has_a_dash_where_nothing_was_measured() -> None:

@@ -1,0 +1,65 @@
+"""What the cores of this machine are worth together, just now: how much more all of them compute at once than one does.
+
+Two cores of one's own are worth 2. A guest whose host runs both on the halves of one core has a little more than one,
+and that changes from minute to minute: a figure of processes that share the work means nothing without it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from deploy.benches.row import core_count
+
+SECONDS, AHEAD = 0.25, 1.0
+"""How long is counted, alone and then together; and the time that processes get to start."""
+SIDE = 96
+"""Of the matrices that are multiplied: both stay in the cache of a core, so that only arithmetic is counted."""
+
+
+def worth() -> float | None:
+    """The products of all cores at once over those of one; None where a process was not there in time."""
+    start = time.monotonic() + AHEAD
+    env = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    command = [sys.executable, "-P", "-m", "deploy.benches.cores", str(start)]
+    children = [
+        subprocess.Popen([*command, str(int(alone))], env=env, stdout=subprocess.PIPE, text=True)
+        for alone in (True, *(False,) * (core_count() - 1))
+    ]
+    counts: list[list[int] | None] = [json.loads(child.communicate()[0]) for child in children]
+    there = [count for count in counts if count is not None]
+    if len(there) < len(counts):
+        return None
+    return round(sum(together for _, together in there) / max(there[0][0], 1), 2)
+
+
+def products(until: float) -> int:
+    """How many small matrices are multiplied until then, seconds of the monotonic clock."""
+    a = np.ones((SIDE, SIDE), np.float32)
+    out, count = np.empty_like(a), 0
+    while time.monotonic() < until:
+        np.matmul(a, a, out=out)
+        count += 1
+    return count
+
+
+def main(argv: list[str]) -> int:
+    """A process that counts: [products alone, products together] as JSON, null when it came too late."""
+    start, first = float(argv[0]), argv[1] == "1"
+    products(time.monotonic() + 0.05)
+    if time.monotonic() > start:
+        print("null")
+        return 0
+    time.sleep(start - time.monotonic() + (0.0 if first else SECONDS))
+    alone = products(start + SECONDS) if first else 0
+    print(json.dumps([alone, products(start + 2 * SECONDS)]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
