@@ -1,4 +1,4 @@
-"""The look-ahead airspace: a UAV waits for a peer's position only when that peer could matter (DESIGN idea 1).
+"""The look-ahead airspace: a UAV waits for a peer's position only when that peer could matter (ADR 0001).
 
 UAV i in cell c_i needs peer j's cell at tick t' only if j could be next to it by then, that is when
 `chebyshev(c_i, c_j(s_j)) - (t' - s_j) <= reach`, with c_j(s_j) the last cell known of j. Otherwise it flies on. So any

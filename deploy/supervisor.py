@@ -21,11 +21,12 @@ STEADY = 10.0
 """Seconds up after which a crash counts as the first again."""
 TRIES = 6
 """Crashes in a row after which the run is given up."""
-OUTSIDE = {-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, process.STOPPED}
+_ORDERLY = {128 + s for s in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+OUTSIDE = {-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, *_ORDERLY}
 """Ends that somebody else brought about: the process is started again, and it does not count as a crash."""
 GRACE = 15.0
 """Seconds that processes get to leave before they are killed."""
-FINAL = {process.USAGE, process.FENCED, 78}
+FINAL = {process.USAGE, process.FENCED}
 """Exit codes after which a process is not started again."""
 
 

@@ -13,7 +13,7 @@ from torch.nn.functional import huber_loss
 
 
 def target(reward: Tensor, discount: Tensor, q_next: Tensor, allowed: Tensor, q_choice: Tensor | None = None) -> Tensor:
-    """Eq. (12): y = r + gamma^n max_a' Q(o', a'; theta-). Shape (B,), no gradient.
+    """Eq. (8): y = r + gamma^n max_a' Q(o', a'; theta-). Shape (B,), no gradient.
 
     `reward` (B,): r_{t+1} + gamma r_{t+2} + ... of n ticks, `discount` (B,): gamma^n; the paper has n = 1. The other
     arguments are those of `value`.
@@ -48,7 +48,7 @@ def td_error(q: Tensor, action: Tensor, y: Tensor) -> Tensor:
 
 
 def loss(td: Tensor, kind: Literal["mse", "huber"] = "mse", weight: Tensor | None = None) -> Tensor:
-    """Eq. (13): the mean squared error over the minibatch; or (ours) Huber: td^2 / 2, linear beyond |td| = 1.
+    """Eq. (9): the mean squared error over the minibatch; or (ours) Huber: td^2 / 2, linear beyond |td| = 1.
 
     `weight` (B,): what each transition counts (ours, `replay.priority`); the paper has none, and so all count alike.
     """

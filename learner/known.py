@@ -1,6 +1,6 @@
 """What theta- says of transitions it has seen before: kept until theta- changes, so that nothing is computed twice.
 
-The value of eq. (12), max_a' Q(o', a'; theta-), of a stored transition stays what it is until theta- = theta, and in
+The value in eq. (8), max_a' Q(o', a'; theta-), of a stored transition stays what it is until theta- = theta, and in
 that time Algorithm 1 draws each transition held about six times (5,000 minibatches of 128 from 100,000). So about four
 fifths of the values are known when they are needed: the forward pass of theta- shrinks to the rest.
 """

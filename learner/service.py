@@ -80,9 +80,11 @@ class Service:
 
     def _prepare(self, welcome: m.Welcome, saved: Saved | None) -> None:
         config = build(json.loads(welcome.config))
+        world = World(config)
+        if world.map.fingerprint != welcome.map:
+            raise EndpointError(f"the map '{config.world.map}' here is not the one that the TMC flies: copy it")
         self._own(welcome.run)
         self.config = config
-        world = World(config)
         self.trainer, self.intake = start(config, world.grid), Intake(Observer(world))
         self.out.mkdir(parents=True, exist_ok=True)
         self.log = LogWriter(self.out / "learner.mcap", "learner", config.journal, {"run": welcome.run}, resume=True)

@@ -1,4 +1,4 @@
-"""The replay memory D: flight records in flat rings, and observations rebuilt from them on sampling (DESIGN idea 3).
+"""The replay memory D: flight records in flat rings, and observations rebuilt from them on sampling (ADR 0002).
 
 A row is one tick of the whole team: where each UAV stood, the action and reward that brought it there, and which map
 frame it last got from the TMC. What UAV i believed at tick t follows: the frame, then the local updates of the ticks

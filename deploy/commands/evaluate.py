@@ -194,7 +194,7 @@ def text(rows: list[Row], config: Config) -> str:
     scenario, ticks = config.scenario, config.training.ticks
     lines = [
         f"Mean uncertainty a road cell: {ticks:,} ticks, scenario {scenario}, T_u = {config.T_u}, {config.world.map};",
-        f"mean of {rows[0].seeds} seeds with its 95 % interval. x bound: against the least that any team could reach.",
+        f"mean of {rows[0].seeds} seeds with its 95 % interval. x bound: against a lower bound that no team can beat.",
         "blocked: moves refused in a mission; collisions: those of them that another UAV stood in the way of.",
         "",
         f"{'who':<32} {'N':>3} {'uncertainty':>18} {'x bound':>8} {'collisions':>11} {'blocked':>8} {'seconds':>8}",

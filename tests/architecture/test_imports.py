@@ -134,3 +134,14 @@ def test_modules_are_short() -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_packages_are_typed(package: str) -> None:
     assert (ROOT / package / "py.typed").is_file()
+
+
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_prose_fits_the_screen(document: Path) -> None:
+    """At most 120 characters a line, as in code; tables and what a command printed are as wide as they are."""
+    parts = document.read_text().split("\n```")[::2]  # what stands between fences is left out
+    long = [line for part in parts for line in part.split("\n") if len(line) > 120 and "|" not in line[:4]]
+    assert long == []

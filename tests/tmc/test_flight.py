@@ -214,7 +214,7 @@ def test_no_two_uavs_share_a_cell(case: tuple[Any, Flight, Referee]) -> None:
 @pytest.mark.parametrize("initial", ["visited", "random"])
 @pytest.mark.parametrize("rates", ["uniform", "volume"])
 def test_the_accounting_identity(mission: Callable[..., Any], toronto: RoadMap, initial: str, rates: str) -> None:
-    """sum_t u_k(t) = F_k - sum_v u_k(t_v before) (1 - q^(T - t_v + 1)) / (1 - q) over all cells (DESIGN section 2)."""
+    """sum_t u_k(t) = F_k - sum_v u_k(t_v before) (1 - q^(T - t_v + 1)) / (1 - q) over all cells (ADR 0006)."""
     T, N = 150, 4
     values = {"team.size": N, "training.ticks": T, "world.initial_map": initial, "world.rates": rates}
     flown = mission({**values, "team.pilot": "planner:greedy"}, toronto).play(Random(1))

@@ -114,7 +114,7 @@ class DQN:
     n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (8): 1")
     double: bool = _s(False, "choose a' by the online network (double Q-learning)", source="eq. (8): no")
     loss: Literal["mse", "huber"] = _s("mse", "loss of Q against its target", source="eq. (9)")
-    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (13): 1")
+    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (9): 1")
     target_episodes: int = _s(5, "f: copy theta to theta- every f episodes; 0: off", "episodes", "Table I")
     target_updates: int = _s(0, "copy theta to theta- every so many updates; 0: off", "updates")
 

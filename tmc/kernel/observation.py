@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Views:
-    """What B observations are made of: what is sent instead of images, a ninth of their size with the paper's map.
+    """What B observations are made of: what is sent instead of images, an eighth of their size with the paper's map.
 
     `cells` (B,) uint16: where the UAV stands. `peers` (B, P) uint16: cells of the sensed UAVs; K where there are fewer.
     `u` (B, R) float32: the UAV's own map, over the monitored cells.

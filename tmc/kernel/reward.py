@@ -20,7 +20,7 @@ class Block(IntEnum):
 
 
 class RewardLaw:
-    """Eq. (11) with the settings `reward.*`; `q`, shape (R,), is exp(-alpha_k) of the monitored cells."""
+    """Eq. (13) with the settings `reward.*`; `q`, shape (R,), is exp(-alpha_k) of the monitored cells."""
 
     def __init__(self, config: Config, q: NDArray[np.float64]) -> None:
         reward = config.reward

@@ -151,7 +151,7 @@ def test_arrival_probability_is_that_of_at_least_one_poisson_event() -> None:
     assert arrival_probability(alpha) == pytest.approx([-math.expm1(-a) for a in alpha], rel=1e-15)
 
 
-# The accounting identity (DESIGN section 2)
+# The accounting identity (ADR 0006)
 
 
 def random_flight(grid: Grid, team: int, ticks: int, seed: int) -> NDArray[np.int64]:
