@@ -50,7 +50,7 @@ def _uncertainty(s: Summary) -> Iterator[str]:
         )
         yield _table_row(label, s.mean.per_cell, s.mean.uncertainty, s.mean.times_bound)
     if s.lower_bound is not None and s.lower_bound_per_cell is not None:
-        yield _table_row("lower bound, by no team beaten", s.lower_bound_per_cell, s.lower_bound, 1.0)
+        yield _table_row("lower bound: no team can beat it", s.lower_bound_per_cell, s.lower_bound, 1.0)
 
 
 def _chosen(s: Summary) -> list[tuple[str, EpisodeFacts]]:
