@@ -49,7 +49,7 @@ class Feed:
 
         A TMC that was started again may number its transitions anew, which a learner must hear first.
         """
-        while self.life >= 0 and self._requests and self.limiter.owed:
+        while self.life >= 0 and self._requests and self.limiter.owed and len(self.replay):
             s = self.replay.sample(self.limiter.updates, self.batch)
             self.limiter.sample()
             yield Minibatch(

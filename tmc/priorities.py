@@ -58,6 +58,10 @@ class Priorities:
         self._largest = max(self._largest, float(priority.max(initial=0.0)))
         self._put(place[known], priority**self.alpha)
 
+    def drop(self, numbers: Ints) -> None:
+        """These, which are held, are not to be drawn any more."""
+        self._put(numbers % self.size, np.zeros(numbers.size))
+
     def _put(self, place: Ints, mass: Reals) -> None:
         self._mass[place] = mass
         block = np.unique(place // BLOCK)

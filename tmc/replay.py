@@ -75,7 +75,7 @@ class Replay:
         self.frames = Ring(frames, (R + 7) // 8 if self._events else R, "u1" if self._events else "u2")
         self.frame_tick = Ring(frames, 0, "u2")
         self.starts, self.ends = Ring(self._starts_kept, 0, "i8"), Ring(self._starts_kept, 0, "i8")
-        self.rows_in = self.frames_in = self.starts_in = self._sure_from = 0
+        self.rows_in = self.frames_in = self.starts_in = self._sure_from = self._whole_from = 0
         self._factors: dict[int, NDArray[np.float64]] = {}
         self._nowhere = np.uint16(world.grid.size)
         self._column = np.append(np.where(world.law.index < 0, R, world.law.index), R).astype(np.int64)
@@ -87,13 +87,43 @@ class Replay:
 
     def __len__(self) -> int:
         """Transitions that can be drawn."""
-        return min(self.starts_in, self._starts_kept) * self.world.config.team.size
+        return (self.starts_in - self._oldest) * self.world.config.team.size
+
+    @property
+    def _oldest(self) -> int:
+        """The oldest start of transitions that can be drawn."""
+        return max(self.starts_in - self._starts_kept, self._whole_from)
+
+    def _let_go(self) -> None:
+        """Give up transitions of which rows or maps are written over.
+
+        While everybody flies there are none: each row but an episode's last is a start, and the rings are as long as
+        that takes. Around the loss of a UAV rows come that are part of no transition, and more maps.
+        """
+        row, frame = self.rows_in - len(self.tick.data), self.frames_in - len(self.frame_tick.data)
+        if row <= 0 and frame <= 0:
+            return
+        first = place = self._oldest
+        while place < self.starts_in and not self._is_whole(int(self.starts[np.array(place)]), row, frame):
+            place += 1
+        self._whole_from = place
+        if self.priorities is not None and place > first:
+            team = self.world.config.team.size
+            self.priorities.drop(np.arange(first * team, place * team))
+
+    def _is_whole(self, start: int, row: int, frame: int) -> bool:
+        """Whether all that the transitions from row `start` are made of is there: what is from `row` and `frame` on."""
+        at = np.array(start)
+        maps = self.base[at][self._present(at)]
+        # The local updates begin at the exchange before, at most T_u rows back.
+        return start - self.world.config.T_u >= row and int(maps.min(initial=self.frames_in)) >= frame
 
     def add_frame(self, tick: int, frame: NDArray[np.generic]) -> int:
         """Keep a map as a UAV got it at `tick`: last visits (R,) u16, or e_k (R,) bool in scenario I. Its number."""
         self.frames[self.frames_in] = np.packbits(frame.astype(bool)) if self._events else frame
         self.frame_tick[self.frames_in] = tick
         self.frames_in += 1
+        self._let_go()
         return self.frames_in - 1
 
     def add_rows(
@@ -118,6 +148,7 @@ class Replay:
         if first == 0:
             self._remember(episode)
         self._add_starts(row, first, sure)
+        self._let_go()
 
     def _add_starts(self, row: int, first: int, sure: Sequence[bool]) -> None:
         """The transitions that end in the rows from `row` on, the first of which is of tick `first`."""
@@ -163,8 +194,8 @@ class Replay:
 
     def digest(self) -> str:
         """BLAKE2b, hex, of every transition that can be drawn and of the maps behind them, whatever their numbers."""
-        held = min(self.starts_in, self._starts_kept)
-        place = np.arange(self.starts_in - held, self.starts_in)
+        place = np.arange(self._oldest, self.starts_in)
+        held = place.size
         start, end = self.starts[place], self.ends[place]
         first = int(start[0]) if held else self.rows_in
         row = np.arange(first, self.rows_in)
@@ -182,8 +213,8 @@ class Replay:
             index = self.priorities.draw(u[:batch])
             weight = self.priorities.weights(index, self.world.config.replay.correction)
             return self.rebuild(*np.divmod(index, self.world.config.team.size), weight)
-        held = min(self.starts_in, self._starts_kept)
-        place = self.starts_in - held + (u[:batch] * held).astype(np.int64)
+        held = self.starts_in - self._oldest
+        place = self._oldest + (u[:batch] * held).astype(np.int64)
         end = self.ends[place].astype(np.int64)
         present = self._present(end)
         order = np.argsort(~present, axis=1, kind="stable")  # those who were not lost come first

@@ -197,3 +197,57 @@ def test_a_zombie_is_not_listened_to_and_is_back_with_the_next_episode() -> None
     station.out.take()
     station.handle(uav_name(0), record, 1001.0)
     assert [(to, getattr(x, "code", "")) for to, x in station.out.take().sends] == [("uav-000", "state")]
+
+
+class Learning(Losing):
+    """Draws from a memory that is long full whenever something comes in."""
+
+    def __init__(self, dies: int, **values: Any) -> None:
+        self.meant: dict[int, tuple[int, int, int]] = {}
+        self.wrong: list[tuple[int, int, int]] = []
+        self.draws = 0
+        super().__init__(dies, **values)
+
+    def keep(self, outbox: Outbox) -> None:
+        super().keep(outbox)
+        replay = self.step.station.replay
+        if not len(replay):
+            return
+        self.draws += 1
+        sample = replay.sample(self.draws, 32)
+        images = replay.observer.observe_batch(sample.views)
+        of = (replay.episode[sample.row].tolist(), replay.tick[sample.row].tolist(), sample.uav.tolist())
+        for number, image, key in zip(sample.index.tolist(), images, zip(*of, strict=True), strict=False):
+            if self.meant.setdefault(number, key) != key or (image != self.seen[key]).any():
+                self.wrong.append(key)
+
+
+@pytest.mark.parametrize("priority", [0.0, 0.6])
+@pytest.mark.parametrize("phase", ["together", "staggered"])
+def test_a_full_memory_draws_nothing_that_is_written_over(
+    monkeypatch: pytest.MonkeyPatch, phase: str, priority: float
+) -> None:
+    """Each number stands for one transition, and each transition is what was seen, before and after the loss."""
+    monkeypatch.setattr("actors.pilot.STINT", 1)
+    mission = Learning(20, **{"comms.phase": phase, "replay.priority": priority, "replay.capacity": 160}).fly()
+    assert mission.draws > 50 and mission.wrong == []
+    assert len(mission.step.station.replay) == 160
+
+
+def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
+    """The whole team is lost for longer than the memory reaches back: the learner waits."""
+    values = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
+    world = World(build({**values, "replay.learn_start": 1, "replay.capacity": 80}))
+    step = LockStep(world, None, lambda _: None)
+    for i in range(N):
+        for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
+            step.fleet.deliver(uav, reply)
+    while step.fleet.pilots[0].t < 35:
+        step.fleet.step()
+    replay, feed = step.station.replay, step.station.feed
+    step.station.limiter.ratio, feed.life = 1.0, 1
+    assert len(replay) == 80 and feed.ask(m.SampleRequest(1)) is None
+    step.station.tick(1000.0)
+    step.station.settle()
+    assert len(replay) == 0 and step.station.limiter.owed
+    assert list(feed.serve(0, 0)) == []
