@@ -42,8 +42,10 @@ def _nodes(net: QNet) -> list[Any]:
     """QNet.forward, operator by operator."""
     nodes, x = [], INPUT
     for i in range(len(net.convs)):
+        behind = {"pads": [0, 0, *net.pad]} if i == 0 and any(net.pad) else {}
+        strides = [net.stride, net.stride]
         nodes += [
-            helper.make_node("Conv", [x, *_layer(f"convs.{i}")], [f"conv{i}"], strides=[net.stride, net.stride]),
+            helper.make_node("Conv", [x, *_layer(f"convs.{i}")], [f"conv{i}"], strides=strides, **behind),
             helper.make_node("Relu", [f"conv{i}"], [f"relu{i}"]),
         ]
         x = f"relu{i}"

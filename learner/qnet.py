@@ -8,12 +8,13 @@ from itertools import pairwise
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from tmc.kernel import draws
 from tmc.kernel.config import Config, Network
 from tmc.kernel.draws import Stream
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.policy import check_view, features
+from tmc.kernel.policy import check_view, features, padding
 
 Shape = tuple[int, int, int]
 """(channels, height, width) of an observation, eq. (12)."""
@@ -22,7 +23,8 @@ Shape = tuple[int, int, int]
 class QNet(nn.Module):
     """Maps observations (B, C, H, W) float32 to the values of the nine actions (B, 9) float32, in scaled reward.
 
-    Sec. IV-B: ReLU after each convolution and after the dense layer, none after the last. With `near` > 0 (ours, off in
+    Sec. IV-B: ReLU after each convolution and after the dense layer, none after the last. Views that the convolutions'
+    strides do not fit are padded in the south and east (`tmc.kernel.policy.padding`). With `near` > 0 (ours, off in
     the paper's preset) the (2 near + 1)^2 cells in the middle, all channels, also go to the dense layer directly: with
     a stride, the convolutions alone would blur which of the cells next to the UAV is which.
     """
@@ -34,11 +36,13 @@ class QNet(nn.Module):
         filters = (channels, *network.channels)
         self.convs = nn.ModuleList(nn.Conv2d(a, b, network.kernel, network.stride) for a, b in pairwise(filters))
         rows, cols = features(network, height, width)
+        self.pad = padding(network, height), padding(network, width)
         self.dense = nn.Linear(filters[-1] * rows * cols + channels * crop_size(near), network.dense)
         self.out = nn.Linear(network.dense, N_ACTIONS)
 
     def forward(self, o: Tensor) -> Tensor:
-        x = o
+        bottom, right = self.pad
+        x = pad(o, (0, right, 0, bottom)) if bottom or right else o
         for conv in self.convs:
             x = torch.relu_(conv(x))  # in place: what does not fit into the caches costs most
         if x.requires_grad and not x.is_contiguous():

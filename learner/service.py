@@ -84,6 +84,7 @@ class Service:
         if world.map.fingerprint != welcome.map:
             raise EndpointError(f"the map '{config.world.map}' here is not the one that the TMC flies: copy it")
         self._own(welcome.run)
+        self._run = welcome.run
         self.config = config
         self.trainer, self.intake = start(config, world.grid), Intake(Observer(world))
         self.out.mkdir(parents=True, exist_ok=True)
@@ -125,6 +126,8 @@ class Service:
         if isinstance(message, m.Minibatch):
             self._ask()
             self._update(message)
+        elif isinstance(message, m.Welcome) and message.run != self._run:
+            raise EndpointError("another mission runs here now: start a learner for it with another --out")
         elif isinstance(message, m.Welcome):  # a TMC that has lost our requests, and perhaps its numbers
             self.trainer.forget()
             self.trainer.version = max(self.trainer.version, message.policy)

@@ -17,6 +17,7 @@ class Feed:
 
     def __init__(self, replay: Replay, limiter: Limiter, batch: int) -> None:
         self.replay, self.limiter, self.batch = replay, limiter, batch
+        self._T = replay.world.config.training.ticks
         self.life = -1
         self.told_the_end = self.recovered = False
         self._requests: list[int] = []
@@ -47,12 +48,15 @@ class Feed:
     def serve(self, episodes: int, ticks: int) -> Iterator[Minibatch]:
         """A minibatch for each request for which one is owed; none before the learner was welcomed.
 
+        It says how many episodes were finished at its tick: by that count theta- follows, also where the learner makes
+        up for what it lost while the team waits.
+
         A TMC that was started again may number its transitions anew, which a learner must hear first.
         """
         while self.life >= 0 and self._requests and self.limiter.owed and len(self.replay):
-            s = self.replay.sample(self.limiter.updates, self.batch)
+            s, finished = self.replay.sample(self.limiter.updates, self.batch), self.limiter.due // self._T
             self.limiter.sample()
             yield Minibatch(
-                self._requests.pop(0), episodes, ticks, s.views.cells, s.views.peers, s.views.u,
+                self._requests.pop(0), min(finished, episodes), ticks, s.views.cells, s.views.peers, s.views.u,
                 s.action, s.reward, s.discount, s.allowed, s.index, s.weight,
             )  # fmt: skip

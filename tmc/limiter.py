@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -32,6 +33,11 @@ class Limiter:
         if self.origin is None:
             return 0
         return max(0, int((self.ticks - self.origin) * self.ratio) - self.updates)
+
+    @property
+    def due(self) -> int:
+        """The tick, counted as `ticks`, from which on the next minibatch is owed."""
+        return (self.origin or 0) + math.ceil((self.updates + 1) / self.ratio)
 
     @property
     def may_insert(self) -> bool:

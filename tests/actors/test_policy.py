@@ -71,7 +71,7 @@ def test_it_chooses_what_the_network_values_most(town: RoadMap, mask: bool, view
     world = World(config, town)
     net = qnet.build(config, view_shape(config, world.grid))
     with torch.no_grad():
-        net.out.weight.normal_(generator=torch.Generator().manual_seed(1))
+        net.out.weight.normal_(generator=torch.Generator().manual_seed(5))
     observer = Observer(world)
     decider = NetworkDecider(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
     chosen = set()
@@ -93,7 +93,7 @@ def test_it_knows_what_actions_are_worth(town: RoadMap, mask: bool, monkeypatch:
     world = World(config, town)
     net = qnet.build(config, view_shape(config, world.grid))
     with torch.no_grad():
-        net.out.weight.normal_(generator=torch.Generator().manual_seed(2))
+        net.out.weight.normal_(generator=torch.Generator().manual_seed(5))
     observer, runs = Observer(world), [0]
     decider = NetworkDecider(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
     q_values = decider.q_values

@@ -26,7 +26,8 @@ def plain_conv(x, weight, bias, stride):
 def plain_forward(net, o):
     """Sec. IV-B in NumPy, one observation (C, H, W)."""
     w = {name: p.detach().numpy().astype(float) for name, p in net.named_parameters()}
-    x = o.astype(float)
+    bottom, right = net.pad
+    x = np.pad(o.astype(float), ((0, 0), (0, bottom), (0, right)))
     for i in range(len(net.convs)):
         x = np.maximum(plain_conv(x, w[f"convs.{i}.weight"], w[f"convs.{i}.bias"], net.stride), 0)
     x = x.ravel()
@@ -48,7 +49,7 @@ def test_parameters_of_the_paper(paper):
 
 def test_patrol_sees_the_near_cells_directly(patrol):
     net = qnet.build(patrol, (3, 17, 17))
-    assert net.dense.in_features == 32 * 2 * 2 + 3 * 5 * 5
+    assert net.dense.in_features == 32 * 3 * 3 + 3 * 5 * 5
 
 
 @pytest.mark.parametrize("near", [0, 1, 2])
@@ -58,6 +59,22 @@ def test_forward_is_the_plain_loop(small, near):
     q = net(torch.tensor(o)).detach().numpy()
     assert q.shape == (3, 9)
     np.testing.assert_allclose(q, [plain_forward(net, one) for one in o], atol=1e-6)
+
+
+@pytest.mark.parametrize("height, width", [(17, 17), (30, 30), (31, 33), (12, 35), (10, 10), (21, 44)])
+@pytest.mark.parametrize("kernel, stride", [(4, 2), (3, 2), (4, 1)])
+def test_every_cell_of_the_view_counts(paper, height, width, kernel, stride):
+    """With strides, the convolutions leave out what is over at the end: a UAV there would not see its own mark."""
+    config = build({"network.kernel": kernel, "network.stride": stride}, paper)
+    net = qnet.build(config, (3, height, width))
+    rng = torch.Generator().manual_seed(1)
+    o = torch.randn(16, 3, height, width, generator=rng, requires_grad=True)
+    seen = torch.autograd.grad(net(o).sum(), o)[0].abs().amax((0, 1)) > 0
+    assert seen.all()
+
+
+def test_the_papers_view_needs_no_padding(paper):
+    assert qnet.build(paper, PAPER_SHAPE).pad == (0, 0)
 
 
 def test_values_may_be_negative(paper):

@@ -9,6 +9,7 @@ import pytest
 
 from learner.service import Service
 from tmc.kernel.config import build, flat
+from tmc.kernel.world import World
 from tmc.wire import messages as m
 from tmc.wire.sockets import EndpointError
 
@@ -23,3 +24,18 @@ def test_a_map_that_is_not_the_tmcs_is_refused(tmp_path: Path) -> None:
     finally:
         service.close()
     assert not (tmp_path / "R").exists()
+
+
+def test_a_welcome_to_another_mission_ends_the_learner(tmp_path: Path) -> None:
+    """A TMC that was started anew on the same port: what was learned here is not that mission's."""
+    service = Service(f"ipc://{tmp_path}/sync", tmp_path / "R")
+    config = build({"network.channels": (2, 2), "network.dense": 2})
+    world = World(config)
+    first, other = (m.Welcome(json.dumps(flat(config)), world.map.fingerprint, run, "", 0, 0) for run in ("a", "b"))
+    try:
+        service._prepare(first, None)
+        with pytest.raises(EndpointError, match="another mission runs here now"):
+            service._obey(other)
+        assert not service._obey(first)
+    finally:
+        service.close()

@@ -35,7 +35,7 @@ def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., 
     assert list(feed.serve(0, 0)) == []  # it asks again
     assert feed.ask(SampleRequest(2)) is None
     (minibatch,) = feed.serve(1, 20)
-    assert (minibatch.request, minibatch.episodes, minibatch.ticks) == (2, 1, 20)
+    assert (minibatch.request, minibatch.episodes, minibatch.ticks) == (2, 0, 20)
     s = feed.replay.sample(0, 4)
     assert np.array_equal(minibatch.index, s.index) and np.array_equal(minibatch.u, s.views.u)
     assert minibatch.weight.size == 0  # all count alike
@@ -44,6 +44,20 @@ def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., 
 def test_only_so_many_requests_are_taken(mission: Callable[..., Any], town: RoadMap) -> None:
     feed = feed_of(mission, town)
     assert [feed.ask(SampleRequest(n)) is None for n in range(WINDOW + 1)] == [True] * WINDOW + [False]
+
+
+def test_a_learner_that_makes_up_for_what_it_lost_hears_of_the_episodes_in_their_turn(
+    mission: Callable[..., Any], town: RoadMap
+) -> None:
+    """Or theta- would not follow until it is done: the team waits for it, and no episode ends meanwhile."""
+    feed = feed_of(mission, town)
+    feed.limiter.insert(4 * 20 - feed.limiter.ticks, 60)
+    feed.welcome(Hello("learner", -1, 9))
+    told = []
+    while feed.limiter.owed:
+        assert feed.ask(SampleRequest(len(told))) is None
+        told += [minibatch.episodes for minibatch in feed.serve(4, 80)]
+    assert told == [tick // 20 for tick in range(2, 81)]  # learning started after the first tick
 
 
 PRIORITISED = {**VALUES, "team.pilot": "policy", "replay.priority": 0.5}

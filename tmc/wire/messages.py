@@ -176,7 +176,7 @@ class Minibatch(Message):
 
     `cells` (2b,), `peers` (2b, P), `u` (2b, R): the fields of `tmc.kernel.observation.Views`, first those of o_t, then
     those of o_{t+n}. `reward`: the n-step sum, unscaled. `discount`: gamma^n. `allowed`: (b, 9), 0 for the actions that
-    a UAV in o_{t+n} would not choose. `episodes`: finished so far. `index`: a number of each transition, which no
+    a UAV in o_{t+n} would not choose. `episodes`: finished by its tick. `index`: a number of each transition, which no
     other has before the TMC's next `Welcome`. `weight`: of each transition in the loss; empty where all count alike,
     that is where `replay.priority` is 0.
     """
