@@ -80,7 +80,7 @@ def test_the_example_of_the_document_runs(tmp_path, monkeypatch, capsys):
 
     with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
         log.write("/tmc/metrics", schemas.TeamMetrics(episode=7, first=0, uncertainty=[1.5, 2.5]))
-    (code,) = re.findall(r"```python\n(.*?)```", DOC.read_text(), re.S)
+    code, _with_pandas = re.findall(r"```python\n(.*?)```", DOC.read_text(), re.S)
     monkeypatch.chdir(tmp_path)
     exec(code, {})
     assert capsys.readouterr().out == "7 0 [1.5, 2.5]\n"
