@@ -231,7 +231,7 @@ class Service:
         elif self.radio is not None and not self.sock.poll(200):
             self.radio.ask(waiting.peer)
         waited = time.monotonic() - start
-        if self.table is None or waited >= NAP:
+        if self.table is None or waited >= NAP or tries >= 10:  # a row may show another episode at once, for ever
             self._listen(0)
         self.waited += waited
 

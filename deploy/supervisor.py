@@ -99,7 +99,14 @@ class Supervisor:
                 return True
             if code:
                 self._ended(running, code)
+            elif code == 0 and self._may_be_needed(running):
+                self._again(running, "left before the TMC was back", BACKOFF[0])
         return False
+
+    def _may_be_needed(self, left: _Running) -> bool:
+        """Whether the TMC was started again after a process that has left in order, and may not know that it has."""
+        lead = next((r for r in self.running if r.child.leads and r.handle is not None), None)
+        return lead is not None and left.started < lead.started and time.monotonic() < lead.started + GRACE
 
     def _ended(self, running: _Running, code: int) -> None:
         """A process ended that should not have: start it again, or give up."""
@@ -111,9 +118,13 @@ class Supervisor:
         if not child.restart or code in FINAL or running.crashes >= TRIES:
             raise MissionFailed(f"{child.name} {how}{self._reason(log)}; its output is in {log}")
         delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1]) if crashed else BACKOFF[0]
+        self._again(running, how, delay)
+
+    def _again(self, running: _Running, how: str, delay: float) -> None:
+        """Start a process again, a while later."""
         running.handle, running.again_at = None, time.monotonic() + delay
         running.restarts += 1
-        self.say(f"{child.name} {how}; it is started again (log: {log})")
+        self.say(f"{running.child.name} {how}; it is started again (log: {self.log_of(running.child.name)})")
 
     @staticmethod
     def _reason(log: Path) -> str:

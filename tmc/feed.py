@@ -25,8 +25,9 @@ class Feed:
     def welcome(self, hello: Hello) -> None:
         """A learner is here, perhaps back from an older checkpoint: what it lost since is owed to it again."""
         self._requests.clear()  # it asks again once it is welcome
+        self.told_the_end = False  # or it would not have said hello
         if hello.life != self.life:
-            self.life, self.told_the_end = hello.life, False
+            self.life = hello.life
             # A TMC that was started again knows how far the learner was a moment ago; the learner knows how far it is.
             self.limiter.updates = hello.updates if self.recovered else min(self.limiter.updates, hello.updates)
             self.recovered = False

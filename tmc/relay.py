@@ -25,15 +25,18 @@ def beacon(station: Station, sender: str, message: m.Beacon, _now: float) -> Non
 def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
     """A UAV is slow, not lost. Should it have flown on from what is not known here, it must say it again.
 
-    It may wait for a peer that waits for an exchange that a TMC that was started again cannot hold without it.
+    It may wait for a peer that waits for an exchange that a TMC that was started again cannot hold without it. And one
+    that was declared lost, and is there after all, must say hello to take part in the next episode.
     """
     if not 0 <= message.uav < len(station.roster) or sender != uav_name(message.uav):
         return
-    member = station.roster[message.uav]
+    member, flight = station.roster[message.uav], station.flight
     if message.life == member.life:
         member.heard, member.named = now, False
-    elif member.life < 0 or message.life in member.past:
-        return  # lost, or another process flies it now
+        if flight is not None and message.peer in flight.lost:  # it waits for one of whose loss it has not heard
+            station.send(sender, m.Lost(flight.episode, message.peer, flight.lost[message.peer]))
+    elif message.life in member.past:
+        return  # another process flies it now
     if message.life != member.life or message.sequence > member.sequence + station.early.count(message.uav):
         station.reject(sender, "state", f"{sender} has flown on from what is not known here: say hello")
 

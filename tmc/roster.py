@@ -28,6 +28,12 @@ class Outbox:
         taken, self.sends = self.sends, []
         return taken
 
+    def take_entries(self) -> Outbox:
+        """The entries and notes alone."""
+        taken = Outbox([], self.entries, self.notes)
+        self.entries, self.notes = [], []
+        return taken
+
     def take(self) -> Outbox:
         """All of it; this outbox is empty afterwards."""
         taken = Outbox(self.sends, self.entries, self.notes)

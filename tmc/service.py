@@ -109,7 +109,7 @@ class Service:
         """Hand over to the journal whatever was accepted."""
         if self.station.learning:
             self.journal.keep_policies(self.station.policies.held())
-        self.journal.take(self.station.out.take())
+        self.journal.take(self.station.out.take_entries())
 
     def _commit(self) -> None:
         """Commit the journal, in which is whatever was accepted: so all of it is acknowledged."""

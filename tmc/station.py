@@ -209,7 +209,8 @@ class Station:
             self.lose(flight, i)
         for i, member in enumerate(self.roster):
             member.answer, member.policy = None, self.policies.newest
-            self._held.append((uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence)))
+            if i not in away:
+                self._held.append((uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence)))
         self._release()
 
     def _resume(self, i: int) -> None:
@@ -316,7 +317,9 @@ class Station:
             text = f"has been silent for {patience:g} s at tick {flight.next_exchange}; others wait"
             self.out.notes.append(("WARNING", f"{uav_name(i)} {text}"))
         for i in roster.long_silent(self.roster, now, self.config.comms.lost_after):
-            if self.flight is flight:  # else the first of them ended the episode
+            if i in flight.lost:  # it was back, for the next episode
+                self.roster[i].life = -1
+            elif self.flight is flight:  # else the first of them ended the episode
                 self.lose(flight, i)
                 self.early.accept(self, flight)
                 self.settle()

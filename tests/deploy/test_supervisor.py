@@ -104,6 +104,21 @@ def test_the_mission_ends_with_its_leader(supervise) -> None:
     assert supervisor.exit_codes() == {"tmc": 0}
 
 
+def test_who_left_before_the_tmc_was_back_is_started_again(supervise, tmp_path: Path) -> None:
+    """Told that the mission is over, or that the TMC was stopped; the TMC's next life may need them all the same."""
+    once = f"import pathlib, sys, time; seen = pathlib.Path({str(tmp_path)!r}) / NAME; new = not seen.exists(); "
+    then = "seen.touch(); time.sleep(WAIT if new else 60); sys.exit(CODE if new else 0)"
+
+    def child(name: str, wait: float, code: int, *, leads: bool) -> Child:
+        text = (once + then).replace("NAME", repr(name)).replace("WAIT", str(wait)).replace("CODE", str(code))
+        return python(name, text, leads=leads)
+
+    tmc = child("tmc", 1.0, process.STOPPED, leads=True)
+    supervisor = supervise(tmc, child("uav-000", 0.0, 0, leads=False), child("uav-001", 1.5, 0, leads=False))
+    everybody = {"tmc": 1, "uav-000": 1, "uav-001": 1}
+    watch_until(supervisor, lambda: supervisor.restarts() == everybody and len(supervisor.pids()) == 3)
+
+
 def test_kills_from_outside_do_not_count(supervise, tmp_path: Path) -> None:
     supervisor = supervise(uav(0, tmp_path))
     seen: set[int] = set()

@@ -17,7 +17,7 @@ from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
 from tmc.replay import Ring
-from tmc.roster import LEARNER, uav_name
+from tmc.roster import LEARNER, Outbox, away, uav_name
 from tmc.station import Station
 from tmc.wire import messages as m
 from tmc.wire.codec import encode
@@ -337,6 +337,41 @@ def test_a_silent_uav_is_named_once(flying: Station) -> None:
     assert "uav-001" in text and "tick 4" in text
 
 
+def test_who_waits_for_a_lost_uav_is_told_again_that_it_is_lost(flying: Station) -> None:
+    """The first telling may have been lost with a connection, or with a TMC that was killed."""
+    assert flying.flight is not None
+    flying.lose(flying.flight, 1)
+    flying.out.take()
+    flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 5.0)
+    ((to, lost),) = flying.out.take().sends
+    assert to == "uav-000" and lost == m.Lost(1, 1, -1)
+    flying.handle("uav-000", m.Alive(0, 1, 0, -1, 0), 6.0)
+    assert flying.out.take().sends == []
+
+
+def test_a_lost_uav_that_is_there_after_all_is_lost_once_and_has_no_part_in_the_episode(flying: Station) -> None:
+    assert flying.flight is not None
+    patience = flying.config.comms.lost_after
+    flying.lose(flying.flight, 1)
+    flying.out.take()
+    flying.handle("uav-001", m.Alive(1, 1, 0, -1, 0), 5.0)
+    assert kinds(flying.out.take().sends) == [("uav-001", "Error")]
+    flying.handle("uav-001", m.Hello("uav", 1, 1), 6.0)
+    assert kinds(flying.out.take().sends) == [("uav-001", "Welcome")]
+    flying.handle("uav-000", m.Alive(0, 1, 0, -1, 0), 6.0 + patience)
+    flying.tick(7.0 + patience)
+    assert flying.out.take().entries == [] and away(flying.roster) == [1]
+    flying.flight = None
+    flying.begin_episode([1])
+    assert [to for to, message in flying.out.take().sends if isinstance(message, m.Begin)] == ["uav-000"]
+
+
+def test_what_is_to_be_said_outlasts_the_writing_of_the_journal() -> None:
+    out = Outbox([("uav-000", m.End("over"))], [], [("INFO", "a note")])
+    assert out.take_entries().notes == [("INFO", "a note")] and out.notes == []
+    assert kinds(out.take_sends()) == [("uav-000", "End")]
+
+
 def test_a_uav_that_came_back_can_be_named_again(flying: Station) -> None:
     flying.tick(40.0)
     assert len(flying.out.take().notes) == 2
@@ -528,6 +563,16 @@ def test_a_learner_that_comes_back_after_the_end_is_told(learning: Learning) -> 
     assert station.phase == "learning"
     sends = learning.ask(0, 1, 2)
     assert kinds([s for s in sends if s[0] == LEARNER]) == [("learner", "Minibatch")] * 2 + [("learner", "End")]
+
+
+def test_a_learner_that_did_not_hear_of_the_end_is_told_again(learning: Learning) -> None:
+    """Its connection was down just then; it says hello after a second of silence."""
+    finish(learning)
+    station = learning.station
+    learning.ask(0, 1, 2)
+    assert station.phase == "done"
+    station.handle(LEARNER, m.Hello("learner", -1, station.feed.life, station.limiter.updates), 1.0)
+    assert kinds(sent(station)) == [("learner", "Welcome"), ("learner", "End")]
 
 
 def test_a_mission_without_a_learner_ends_with_its_last_record(mission: Callable[..., Any], town: RoadMap) -> None:
