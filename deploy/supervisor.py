@@ -24,6 +24,8 @@ TRIES = 6
 _ORDERLY = {128 + s for s in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
 OUTSIDE = {-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, *_ORDERLY}
 """Ends that somebody else brought about: the process is started again, and it does not count as a crash."""
+INFANCY = 0.4
+"""Seconds in which a TMC that was started has not sent anybody home yet: it takes longer to import what it needs."""
 GRACE = 15.0
 """Seconds that processes get to leave before they are killed."""
 FINAL = {process.USAGE, process.FENCED}
@@ -41,6 +43,8 @@ class _Running:
     started: float = 0.0
     crashes: int = 0
     restarts: int = 0
+    left: float = 0.0
+    """When it was first seen to have ended in order; 0.0 while it has not."""
     again_at: float = 0.0
 
 
@@ -99,14 +103,16 @@ class Supervisor:
                 return True
             if code:
                 self._ended(running, code)
-            elif code == 0 and self._may_be_needed(running):
-                self._again(running, "left before the TMC was back", BACKOFF[0])
+            elif code == 0:
+                running.left = running.left or time.monotonic()
+                if self._left_a_former_life(running):
+                    self._again(running, "left before the TMC was back", BACKOFF[0])
         return False
 
-    def _may_be_needed(self, left: _Running) -> bool:
-        """Whether the TMC was started again after a process that has left in order, and may not know that it has."""
+    def _left_a_former_life(self, running: _Running) -> bool:
+        """Whether it was sent home by a life of the TMC that is over: the next one may need it all the same."""
         lead = next((r for r in self.running if r.child.leads and r.handle is not None), None)
-        return lead is not None and left.started < lead.started and time.monotonic() < lead.started + GRACE
+        return lead is not None and running.started < lead.started and running.left < lead.started + INFANCY
 
     def _ended(self, running: _Running, code: int) -> None:
         """A process ended that should not have: start it again, or give up."""
@@ -122,7 +128,7 @@ class Supervisor:
 
     def _again(self, running: _Running, how: str, delay: float) -> None:
         """Start a process again, a while later."""
-        running.handle, running.again_at = None, time.monotonic() + delay
+        running.handle, running.left, running.again_at = None, 0.0, time.monotonic() + delay
         running.restarts += 1
         self.say(f"{running.child.name} {how}; it is started again (log: {self.log_of(running.child.name)})")
 
