@@ -98,8 +98,10 @@ class Service:
                 message = self._receive()
                 if isinstance(message, m.Welcome):
                     return self._make_pilot(message)
-                if isinstance(message, m.End | m.Error):
-                    self._obey(message)
+                if isinstance(message, m.End):
+                    raise Left(process.DONE, message.reason)
+                if isinstance(message, m.Error):
+                    self._on_error(message)
         raise Left(process.STOPPED, "stopped before the TMC answered")
 
     def _make_pilot(self, welcome: m.Welcome) -> tuple[Pilot, RadioTracks | None]:

@@ -62,6 +62,8 @@ def take_up(station: Station, journal: Journal) -> None:
     """Play the journal that an earlier life left, and write what is missing in it."""
     start = time.monotonic()
     missing = recover(station, journal.writer.active, start)
+    for member in station.roster:
+        member.heard = time.monotonic()  # nobody could be heard while the journal was played
     journal.take(Outbox(entries=missing))
     journal.commit()
     seconds, flight = time.monotonic() - start, station.flight

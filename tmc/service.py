@@ -212,6 +212,7 @@ class Service:
     def _finished(self) -> bool:
         """Over, and everybody has left or was given time to."""
         if self.station.phase != "done":
+            self._over = None  # a learner from an older checkpoint makes up for what it lost
             return False
         now = time.monotonic()
         self._over = self._over or now

@@ -61,7 +61,7 @@ class Station:
             return "flying"
         if self.episodes < self.config.training.episodes:
             return "gathering"
-        return "learning" if self.limiter.owed else "done"
+        return "learning" if self.limiter.owed and len(self.replay) else "done"
 
     def waiting_for(self) -> list[str]:
         """Who keeps the mission from going on: processes not here yet, or UAVs whose record is due next."""
@@ -258,7 +258,7 @@ class Station:
     # Answers held back by the limiter.
 
     def _release(self) -> None:
-        if self.limiter.may_insert or self.flight is None:
+        if self.limiter.may_insert or self.flight is None or not len(self.replay):  # nothing to learn from: fly on
             for to, message in self._held:
                 if isinstance(message, m.Map):
                     self.roster[int(to[4:])].answer = message

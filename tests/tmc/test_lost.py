@@ -237,7 +237,7 @@ def test_a_full_memory_draws_nothing_that_is_written_over(
 def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
     """The whole team is lost for longer than the memory reaches back: the learner waits."""
     values = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
-    world = World(build({**values, "replay.learn_start": 1, "replay.capacity": 80}))
+    world = World(build({**values, "replay.learn_start": 1, "replay.capacity": 80, "training.episodes": 1}))
     step = LockStep(world, None, lambda _: None)
     for i in range(N):
         for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
@@ -251,3 +251,4 @@ def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
     step.station.settle()
     assert len(replay) == 0 and step.station.limiter.owed
     assert list(feed.serve(0, 0)) == []
+    assert step.station.phase == "done"  # nor does anybody wait for it
