@@ -166,23 +166,28 @@ def test_what_is_learned_from_is_what_was_seen(losing: Callable[[int], Losing], 
     assert {e for e, t, i in zip(episodes, ticks, sample.uav, strict=True) if i == LOST} >= {1, 3}
 
 
-@pytest.mark.parametrize("priority", [0.0, 0.6])
-def test_nothing_is_drawn_of_ticks_in_which_nobody_is_left(priority: float) -> None:
-    values = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
-    world = World(build({**values, "replay.learn_start": 1, "replay.priority": priority}))
-    step = LockStep(world, None, lambda _: None)
+def flown_to(tick: int, **values: Any) -> LockStep:
+    """A mission in one process, at that tick of its first episode."""
+    settings = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
+    step = LockStep(World(build({**settings, "replay.learn_start": 1, **values})), None, lambda _: None)
     for i in range(N):
         for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
             step.fleet.deliver(uav, reply)
-    while step.fleet.pilots[0].t < 25:
+    while step.fleet.pilots[0].t < tick:
         step.fleet.step()
+    return step
+
+
+@pytest.mark.parametrize("priority", [0.0, 0.6])
+def test_nothing_is_drawn_of_ticks_in_which_nobody_is_left(priority: float) -> None:
+    step = flown_to(25, **{"replay.priority": priority})
     step.station.tick(1000.0)
     assert all(member.life < 0 for member in step.station.roster)
     step.station.settle()
     replay = step.station.replay
     assert replay.rows_in == 91
     sample = replay.sample(1, 2000)
-    assert replay.tick[sample.row].max() < 25 and (sample.views.cells < world.grid.size).all()
+    assert replay.tick[sample.row].max() < 25 and (sample.views.cells < step.world.grid.size).all()
 
 
 def test_a_zombie_is_not_listened_to_and_is_back_with_the_next_episode() -> None:
@@ -236,14 +241,7 @@ def test_a_full_memory_draws_nothing_that_is_written_over(
 
 def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
     """The whole team is lost for longer than the memory reaches back: the learner waits."""
-    values = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
-    world = World(build({**values, "replay.learn_start": 1, "replay.capacity": 80, "training.episodes": 1}))
-    step = LockStep(world, None, lambda _: None)
-    for i in range(N):
-        for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
-            step.fleet.deliver(uav, reply)
-    while step.fleet.pilots[0].t < 35:
-        step.fleet.step()
+    step = flown_to(35, **{"replay.capacity": 80, "training.episodes": 1})
     replay, feed = step.station.replay, step.station.feed
     step.station.limiter.ratio, feed.life = 1.0, 1
     assert len(replay) == 80 and feed.ask(m.SampleRequest(1)) is None
