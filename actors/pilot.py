@@ -191,6 +191,9 @@ class Pilot:
 
         Returns whether a record must go out now.
         """
+        if self.shipped == self.t == self.config.training.ticks:
+            self.phase = Phase.IDLE  # taken up at the episode's end, which its peers may have left behind
+            return False
         self.peers = self.airspace.sense(self.t, self.cell)
         index = self.law.index_list
         for cell in (self.cell, *self.peers):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import time
@@ -32,6 +33,8 @@ from tmc.wire.codec import CodecError
 
 SILENCE = (0.25, 1.0)
 """Seconds after which a message that was not answered goes out again: at first, and at most; doubles in between."""
+ASK_EVERY = 0.2
+"""Seconds after which a UAV that waits for a peer's beacon asks for it, and asks again."""
 STATUS_EVERY = 0.5
 """Seconds between two status messages in the log."""
 TELL_EVERY = 5.0
@@ -64,7 +67,7 @@ class Service:
         self.witness: Witness | None = None
         self.oath: Oath | None = None
         self._said, self._silence = time.monotonic(), SILENCE[0]
-        self._reported, self._status_due, self._asked = (self._said, 0), 0.0, 0.0
+        self._reported, self._status_due, self._asked, self._ask_at = (self._said, 0), 0.0, 0.0, 0.0
 
     def fly(self, stop: Callable[[], bool]) -> NoReturn:
         """The main loop; raises Left when the TMC, or a signal, ends it."""
@@ -155,10 +158,12 @@ class Service:
 
     def _listen(self, patience: float) -> None:
         """Take what has come in; wait up to `patience` seconds for it, and speak again after too long a silence."""
-        if not self.sock.poll(int(patience * 1000)):
-            if time.monotonic() - self._said > self._silence:
-                self._silence = min(2 * self._silence, SILENCE[1])
-                self._repeat()
+        quiet = not self.sock.poll(int(patience * 1000))
+        # The beacons of others are no answer: who flies, or waits for a peer, is heard all the same.
+        if (quiet or self.pilot.under_way) and time.monotonic() - self._said > self._silence:
+            self._silence = min(2 * self._silence, SILENCE[1])
+            self._repeat()
+        if quiet:
             return
         self._silence = SILENCE[0]
         while (message := self._receive()) is not None:
@@ -230,8 +235,12 @@ class Service:
         start, self._peer = time.monotonic(), waiting.peer
         if self.table is not None:
             self.table.wait(waiting.peer, waiting.tick, NAP * min(1 + tries, 10))
-        elif self.radio is not None and not self.sock.poll(200):
-            self.radio.ask(waiting.peer)
+        elif self.radio is not None:
+            self._ask_at = self._ask_at if tries else start + ASK_EVERY
+            self.sock.poll(max(0, math.ceil(1000 * (self._ask_at - start))))
+            if time.monotonic() >= self._ask_at:  # whatever else came in
+                self._ask_at += ASK_EVERY
+                self.radio.ask(waiting.peer)
         waited = time.monotonic() - start
         if self.table is None or waited >= NAP or tries >= 10:  # a row may show another episode at once, for ever
             self._listen(0)

@@ -26,6 +26,8 @@ OUTSIDE = {-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, *_O
 """Ends that somebody else brought about: the process is started again, and it does not count as a crash."""
 INFANCY = 0.4
 """Seconds in which a TMC that was started has not sent anybody home yet: it takes longer to import what it needs."""
+OVERDUE = 5.0
+"""Seconds after which a TMC that still runs needs whoever left: it stays for 3 s at most once everybody has."""
 GRACE = 15.0
 """Seconds that processes get to leave before they are killed."""
 FINAL = {process.USAGE, process.FENCED}
@@ -112,7 +114,9 @@ class Supervisor:
     def _left_a_former_life(self, running: _Running) -> bool:
         """Whether it was sent home by a life of the TMC that is over: the next one may need it all the same."""
         lead = next((r for r in self.running if r.child.leads and r.handle is not None), None)
-        return lead is not None and running.started < lead.started and running.left < lead.started + INFANCY
+        if lead is None or running.started > lead.started:
+            return False
+        return running.left < lead.started + INFANCY or time.monotonic() > running.left + OVERDUE
 
     def _ended(self, running: _Running, code: int) -> None:
         """A process ended that should not have: start it again, or give up."""

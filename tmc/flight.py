@@ -23,8 +23,6 @@ from tmc.wire.messages import EMPTY, Begin, Map, Record
 
 GONE = 65_535
 """Stands for the cell of a UAV that was lost, in the ticks after its last record."""
-
-
 SOME = 64
 """Ticks that are reckoned at once, at most."""
 _UAV = int(Block.UAV)
@@ -91,6 +89,7 @@ class Flight:
         self.next_exchange = 0
         self.believed = np.zeros(R, "<u2")
         self.beliefs = np.zeros((self.N, R), "<u2")
+        self.given = [version] * self.N  # the map that each UAV was answered with last
         # The truth clock: final up to `done`.
         self.done = -1
         self.last_visit = np.zeros(R, "<u2")
@@ -188,6 +187,8 @@ class Flight:
                 break
             if due:
                 done.append(self._exchange(t, due))
+                for i in due:
+                    self.given[i] = self.version
             self.next_exchange += 1
         return done
 
@@ -230,10 +231,9 @@ class Flight:
 
     def begin(self, i: int, policy: int, sequence: int) -> Begin:
         """Fly from the last record that the TMC has of UAV i; at the start of the episode, from its beginning."""
-        shipped, lost = self.reported[i], np.array([*self.lost], "<u2")
-        tick = max(shipped, 0)
+        shipped, lost, tick = self.reported[i], np.array([*self.lost], "<u2"), max(self.reported[i], 0)
         belief, track = self.beliefs[i].copy(), self.cells[: tick + 1, i].copy()
-        return Begin(self.episode, tick, shipped, sequence, self.version, policy, belief, track, lost)
+        return Begin(self.episode, tick, shipped, sequence, self.given[i], policy, belief, track, lost)
 
     def uncertainty(self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """u_k(t) over the monitored cells, scenario II; shapes as in `UncertaintyLaw.values`."""

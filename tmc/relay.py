@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from tmc.roster import uav_name
 from tmc.status import status
@@ -22,6 +25,28 @@ def beacon(station: Station, sender: str, message: m.Beacon, _now: float) -> Non
             station.send(uav_name(i), message)
 
 
+def loss(station: Station, i: int, to: Iterable[int]) -> None:
+    """Tell the UAVs `to` that the team goes on without UAV i."""
+    flight = station.flight
+    assert flight is not None
+    for j in to:
+        tracks(station, j, [i])
+        station.send(uav_name(j), m.Lost(flight.episode, i, flight.lost[i]))
+
+
+def tracks(station: Station, j: int, lost: Iterable[int]) -> None:
+    """Tell UAV j, which shares no table with them, where lost UAVs were: they answer nobody any more.
+
+    Before what tells of a loss, since from then on j does not wait for what it does not know.
+    """
+    flight = station.flight
+    assert flight is not None
+    for i in lost:
+        cells = flight.cells[1 : flight.lost[i] + 1, i].copy()
+        if cells.size and not station.tracks:
+            station.send(uav_name(j), m.Beacon(i, flight.episode, 1, cells, np.array([j], "<u2")))
+
+
 def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
     """A UAV is slow, not lost. Should it have flown on from what is not known here, it must say it again.
 
@@ -34,7 +59,7 @@ def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
     if message.life == member.life:
         member.heard, member.named = now, False
         if flight is not None and message.peer in flight.lost:  # it waits for one of whose loss it has not heard
-            station.send(sender, m.Lost(flight.episode, message.peer, flight.lost[message.peer]))
+            loss(station, message.peer, [message.uav])
     elif message.life in member.past:
         return  # another process flies it now
     if message.life != member.life or message.sequence > member.sequence + station.early.count(message.uav):

@@ -90,6 +90,12 @@ def long_silent(members: list[Member], now: float, patience: float) -> list[int]
     return [i for i, m in enumerate(members) if m.life >= 0 and now - m.heard > patience]
 
 
+def excuse(members: list[Member], pause: float, now: float) -> None:
+    """Nobody could be heard for `pause` seconds before `now`: they are no silence of anybody's."""
+    for member in members:
+        member.heard = min(member.heard + pause, now)
+
+
 Problem = tuple[str, str] | None
 """Error code and sentence, or None when all is well."""
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import zmq
 
+from tmc import roster
 from tmc.journal import Journal
 from tmc.roster import LEARNER, uav_name
 from tmc.station import Station
@@ -22,6 +23,8 @@ BURST = 64
 REST = 0.01
 """Seconds that book-keeping waits for more of its kind: a dozen records in a row cost a third of one at a time, since
 the processor has the code at hand."""
+PAUSE = 1.0
+"""Seconds from one turn of the loop to the next from which on nobody is blamed for them."""
 FAREWELL = 60.0
 """Seconds that the TMC waits for the last client to leave once the mission is over."""
 REUNION = 3.0
@@ -63,6 +66,7 @@ class Service:
         self._free = self._reached() + LEAD if journal.found else 0
         """Up to when UAVs must have been answered before a newer policy is taken."""
         self._waiting: PolicyPush | None = None
+        self._ticked = time.monotonic()
         self._unsettled: float | None = None
         """When the oldest entry came that is not journalled, seconds of the monotonic clock."""
 
@@ -74,7 +78,7 @@ class Service:
         while not stop():
             for sock, _ in poller.poll(self._patience()):
                 self._drain(sock)
-            self.station.tick(time.monotonic())
+            self._tick()
             self._take_waiting()
             self._send()
             self._settle()
@@ -85,6 +89,14 @@ class Service:
         self._say_goodbye("the TMC was stopped")
         self._sum_up()
         return False
+
+    def _tick(self) -> None:
+        """Count the UAVs' silence, without the time in which this process was stopped, or waited for a slow disk."""
+        now, then = time.monotonic(), self._ticked
+        if now - then > PAUSE:
+            roster.excuse(self.station.roster, now - then, now)
+        self._ticked = now
+        self.station.tick(now)
 
     def _patience(self) -> int:
         """Milliseconds to wait for a message; not so long that a silence would be seen late."""

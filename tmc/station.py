@@ -216,6 +216,7 @@ class Station:
     def _resume(self, i: int) -> None:
         flight, member = self.flight, self.roster[i]
         assert flight is not None
+        relay.tracks(self, i, flight.lost)
         self.send(uav_name(i), flight.begin(i, member.policy, member.sequence))
         if member.answer is not None and member.answer.tick == flight.reported[i]:
             self.send(uav_name(i), member.answer)
@@ -332,8 +333,7 @@ class Station:
         self.out.entries.append(entries.lost(flight, i))
         text = f"{uav_name(i)} is lost after tick {last} of episode {flight.episode}; the others go on without it"
         self.out.notes.append(("ERROR", text))
-        for j in range(flight.N):
-            self.send(uav_name(j), m.Lost(flight.episode, i, last))
+        relay.loss(self, i, range(flight.N))
         self._exchange(flight)
 
 

@@ -95,6 +95,19 @@ def u(age: int) -> float:
     return float(np.float32(5 * (1 - np.exp(-0.01 * age))))
 
 
+def test_a_flight_taken_up_at_its_end_asks_nobody_where_it_was(world_of: Callable[..., World]) -> None:
+    """The TMC has all of it; the peers may have begun the next episode, and answer for that one only."""
+    world = world_of({"team.size": 2, "training.ticks": 3, "comms.period": 1000}, STREET)
+    episode = next(e for e in range(1, 1000) if world.starts(e) == [0, 1])
+    pilot = Pilot(world, 0, 2, TableTracks(TrackTable(2, 3), 0), Observer(world), Policies(), Script([]))
+    pilot.begin(begin(world, episode, 0, 0, 0, 0, shipped=3, sequence=2))
+    assert pilot.advance() is None and pilot.phase is Phase.IDLE
+    pilot.on_map(answer(world, episode, 3))
+    assert pilot.advance() is None and pilot.phase is Phase.IDLE
+    pilot.begin(begin(world, episode + 1, world.starts(episode + 1)[0]))
+    assert pilot.phase is Phase.SENSE
+
+
 # Rewards and blocks.
 
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import threading
+import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import zmq
 
 from actors.service import Left, Service
+from tmc.kernel.config import build, flat
+from tmc.kernel.world import World
 from tmc.wire import messages as m
 from tmc.wire import process, sockets
+from tmc.wire.codec import decode
 
 
 def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path) -> None:
@@ -27,6 +35,44 @@ def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path) -> None
             with pytest.raises(Left, match="over") as left:
                 joining.result(20)
             assert left.value.code == process.DONE
+    finally:
+        service.close()
+        context.destroy(linger=0)
+
+
+def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path: Path) -> None:
+    """UAV 0 waits for UAV 1, of which nothing comes, while beacons of UAV 2 come in all the time."""
+    world = World(build({"team.size": 3, "team.pilot": "planner:greedy", "training.ticks": 100}))
+    numbered = ((e, world.starts(e)) for e in range(1, 5000))
+    episode, starts = next((e, s) for e, s in numbered if world.grid.chebyshev(s[0], s[1]) <= 2)
+    endpoint, context = f"ipc://{tmp_path}/sync", zmq.Context[Any]()
+    tmc, service, over = sockets.router(context, endpoint), Service(0, endpoint, tmp_path / "R"), threading.Event()
+    zeros = np.zeros(world.law.cells.size, "<u2")
+    welcome = m.Welcome(json.dumps(flat(world.config)), world.map.fingerprint, "run", "", 0, 0)
+    begin = m.Begin(episode, 0, -1, 0, 0, 0, zeros, np.array(starts[:1], "<u2"), m.EMPTY)
+    beacon = m.Beacon(2, episode, 1, np.array(starts[2:], "<u2"), np.array([0], "<u2"))
+    said: Counter[str] = Counter()
+    try:
+        with ThreadPoolExecutor(1) as other:
+            flying, until = other.submit(service.fly, over.is_set), time.monotonic() + 20.0
+            while (said["ask"] < 5 or said["Alive"] < 2) and time.monotonic() < until:
+                if said["Hello"]:
+                    sockets.send(tmc, beacon, b"uav-000")
+                if not tmc.poll(5):
+                    continue
+                identity, *frames = sockets.receive(tmc) or []
+                message = decode(frames)
+                said[type(message).__name__] += 1
+                said["ask"] += isinstance(message, m.Beacon) and message.ask >= 0
+                if isinstance(message, m.Hello):
+                    for answer in (welcome, begin):
+                        sockets.send(tmc, answer, bytes(identity))
+                elif isinstance(message, m.Record):
+                    sockets.send(tmc, m.Map(episode, 0, 1, 0, 0, 0, zeros, m.EMPTY), bytes(identity))
+            over.set()
+            with pytest.raises(Left):
+                flying.result(20)
+        assert said["ask"] >= 5 and said["Alive"] >= 2, said
     finally:
         service.close()
         context.destroy(linger=0)

@@ -104,18 +104,38 @@ def test_the_mission_ends_with_its_leader(supervise) -> None:
     assert supervisor.exit_codes() == {"tmc": 0}
 
 
-def test_who_left_before_the_tmc_was_back_is_started_again(supervise, tmp_path: Path) -> None:
+@pytest.fixture
+def once(tmp_path: Path) -> Callable[[str, float, int], Child]:
+    """A process that ends with `code` after `wait` seconds; started again, it stays."""
+
+    def make(name: str, wait: float, code: int) -> Child:
+        text = (
+            f"import pathlib, sys, time; seen = pathlib.Path({str(tmp_path)!r}) / {name!r}; new = not seen.exists(); "
+        )
+        text += f"seen.touch(); time.sleep({wait} if new else 60); sys.exit({code} if new else 0)"
+        return python(name, text, leads=name == "tmc")
+
+    return make
+
+
+def test_who_left_before_the_tmc_was_back_is_started_again(supervise, once) -> None:
     """Told that the mission is over, or that the TMC was stopped; the TMC's next life may need them all the same."""
-    once = f"import pathlib, sys, time; seen = pathlib.Path({str(tmp_path)!r}) / NAME; new = not seen.exists(); "
-    then = "seen.touch(); time.sleep(WAIT if new else 60); sys.exit(CODE if new else 0)"
-
-    def child(name: str, wait: float, code: int, *, leads: bool) -> Child:
-        text = (once + then).replace("NAME", repr(name)).replace("WAIT", str(wait)).replace("CODE", str(code))
-        return python(name, text, leads=leads)
-
-    tmc = child("tmc", 1.0, process.STOPPED, leads=True)
-    supervisor = supervise(tmc, child("uav-000", 0.0, 0, leads=False))
+    supervisor = supervise(once("tmc", 1.0, process.STOPPED), once("uav-000", 0.0, 0))
     watch_until(supervisor, lambda: supervisor.restarts() == {"tmc": 1, "uav-000": 1} and len(supervisor.pids()) == 2)
+
+
+def test_who_took_long_to_leave_a_tmc_that_was_killed_is_started_again(supervise, once, monkeypatch) -> None:
+    """Told that the mission is over by the TMC's last life. Who came after that is not called back."""
+    monkeypatch.setattr(supervisors, "OVERDUE", 1.0)
+    supervisor = supervise(once("tmc", 0.5, process.STOPPED), once("learner", 2.0, 0))
+    begin = time.monotonic()
+    watch_until(supervisor, lambda: supervisor.restarts() == {"tmc": 1, "learner": 1})
+    assert time.monotonic() - begin > 3.0
+    supervisor.running[1].started = supervisor.running[0].started - 1.0
+    supervisor.running[1].left = time.monotonic() - 9.0
+    assert supervisor._left_a_former_life(supervisor.running[1])
+    supervisor.running[1].started = supervisor.running[0].started + 1.0
+    assert not supervisor._left_a_former_life(supervisor.running[1])
 
 
 def test_kills_from_outside_do_not_count(supervise, tmp_path: Path) -> None:

@@ -200,10 +200,8 @@ class Mission:
             self._say_again(i, message.sequence)
         elif isinstance(message, m.End):
             self.home.add(i)
-        elif isinstance(message, m.Beacon):
-            tracks = pilot.airspace.tracks
-            assert isinstance(tracks, RadioTracks)
-            tracks.hear(message)
+        elif isinstance(message, m.Beacon) and isinstance(pilot.airspace.tracks, RadioTracks):
+            pilot.airspace.tracks.hear(message)
         if isinstance(message, m.Error):
             assert self.restarts and message.code == "state", message.text
             answer = m.Hello("uav", i, self.lives[i])

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,7 +47,7 @@ class Client:
     """A client of the TMC, which takes what comes until it is what it waits for."""
 
     def __init__(self, context: zmq.Context[Any], endpoint: str, name: str) -> None:
-        self.sock = sockets.dealer(context, endpoint, name)
+        self.sock, self.heard = sockets.dealer(context, endpoint, name), list[m.Message]()
 
     def say(self, *messages: m.Message) -> None:
         for message in messages:
@@ -54,7 +56,8 @@ class Client:
     def hear(self, kind: type[Said]) -> Said:
         while self.sock.poll(PATIENCE):
             message = sockets.receive_message(self.sock)
-            assert not isinstance(message, m.Error), message
+            assert message is not None and not isinstance(message, m.Error), message
+            self.heard.append(message)
             if isinstance(message, kind):
                 return message
         raise AssertionError(f"the TMC sent no {kind.__name__}")
@@ -126,14 +129,14 @@ def endpoint_of(name: str, folder: Path) -> str:
 
 
 @contextmanager
-def killed_in_the_end(world: World, folder: Path) -> Iterator[None]:
+def killed_in_the_end(world: World, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A TMC that goes on with what is in `folder`, and is killed when the block is left."""
     config = folder / "config.json"
     config.write_text(json.dumps(flat(world.config)))
     options = ("--config", str(config), "--bind", endpoint_of("uav-000", folder), "--out", str(folder), "--resume")
     with subprocess.Popen([sys.executable, "-P", "-m", "tmc", *options], cwd=ROOT) as tmc:
         try:
-            yield
+            yield tmc
         finally:
             tmc.kill()
 
@@ -206,6 +209,20 @@ def test_an_episode_is_committed_before_the_next_one_begins(client: Callable[[st
     assert left is not None
     recover(station, left, 0.0)
     assert station.episodes == 1
+
+
+def test_a_tmc_that_was_stopped_blames_nobody_for_the_silence(client: Callable[[str], Client], tmp_path: Path) -> None:
+    """As by a suspended machine, or a commit that a slow disk holds up."""
+    short = World(build({**VALUES, "comms.lost_after": 1.5, "team.pilot": "planner:greedy"}))
+    with killed_in_the_end(short, tmp_path) as tmc:
+        uav = Uav(client("uav-000"), short, 1)
+        for _ in range(3):
+            tmc.send_signal(signal.SIGSTOP)
+            time.sleep(2.0)
+            tmc.send_signal(signal.SIGCONT)
+            time.sleep(0.2)
+            uav.exchange()
+        assert not [said for said in uav.client.heard if isinstance(said, m.Lost)]
 
 
 def test_a_loss_is_committed_before_anybody_is_told(client: Callable[[str], Client], tmp_path: Path) -> None:

@@ -70,8 +70,9 @@ def next_record(station: Station, i: int, first: int, tick: int, sequence: int, 
     assert station.flight is not None
     n = tick - first + 1
     cells = np.full(n, station.flight.starts[i], "<u2")
-    stay, zero = np.full(n, 8, "u1"), np.zeros(n, "u1")
-    reward = np.zeros(n, "<f4")
+    moves = tick - max(first, 1) + 1
+    stay, zero = np.full(moves, 8, "u1"), np.zeros(moves, "u1")
+    reward = np.zeros(moves, "<f4")
     return m.Record(i, life, sequence, 1, first, tick, 0, 0, cells, stay, zero, reward, m.EMPTY, m.EMPTY)
 
 
@@ -347,6 +348,42 @@ def test_who_waits_for_a_lost_uav_is_told_again_that_it_is_lost(flying: Station)
     assert to == "uav-000" and lost == m.Lost(1, 1, -1)
     flying.handle("uav-000", m.Alive(0, 1, 0, -1, 0), 6.0)
     assert flying.out.take().sends == []
+
+
+@pytest.mark.parametrize("tracks", ["", "a table"])
+def test_who_shares_no_table_is_told_where_a_lost_uav_was(station_of: Callable[..., Station], tracks: str) -> None:
+    """A beacon may have been lost, and it can no longer be asked."""
+    station = station_of(tracks=tracks)
+    hello(station, 0)
+    hello(station, 1)
+    assert station.flight is not None
+    for i, record in (
+        (0, first_record(station, 0)),
+        (1, first_record(station, 1)),
+        (1, next_record(station, 1, 1, 4, 1)),
+    ):
+        station.handle(uav_name(i), record, 1.0)
+    sent(station)
+    station.lose(station.flight, 1)
+    told = [message for to, message in sent(station) if to == "uav-000"]
+    cells = np.full(4, station.flight.starts[1], "<u2")
+    beacons = [] if tracks else [m.Beacon(1, 1, 1, cells, np.array([0], "<u2"))]
+    assert [frames(x) for x in told] == [frames(x) for x in (*beacons, m.Lost(1, 1, 4))]
+    again = [message for _, message in hello(station, 0, life=2)]  # its next process is told before it flies on
+    assert [type(x) for x in again] == [m.Welcome, *(type(x) for x in beacons), m.Begin, m.Map]
+
+
+def test_a_flight_is_taken_up_by_the_map_that_its_uav_was_given(station_of: Callable[..., Station]) -> None:
+    """Not by a newer one, which another UAV was given at an exchange of its own."""
+    station = station_of({"comms.phase": "staggered"})
+    hello(station, 0)
+    hello(station, 1)
+    station.handle("uav-000", first_record(station, 0), 1.0)
+    station.handle("uav-001", next_record(station, 1, 0, 2, 0), 1.0)
+    assert (station.version, station.flight is not None) == (2, True)
+    for i, version in ((0, 1), (1, 2)):
+        (taken_up,) = (x for _, x in hello(station, i, life=2) if isinstance(x, m.Begin))
+        assert taken_up.version == version
 
 
 def test_a_lost_uav_that_is_there_after_all_is_lost_once_and_has_no_part_in_the_episode(flying: Station) -> None:

@@ -21,8 +21,7 @@ UNKNOWN = -1
 class Record:
     """One flight record, less its arrays.
 
-    `given`: the map versions, from the first to the last, that its UAV may fly by: that of its last exchange, or of the
-    last one before the episode; where its process is a new one, any up to the newest.
+    `given`: the version of the map that its UAV was given: at its last exchange, or before the episode.
     """
 
     uav: int
@@ -30,7 +29,7 @@ class Record:
     first: int
     tick: int
     version: int
-    given: tuple[int, int]
+    given: int
 
 
 @dataclass
@@ -59,15 +58,14 @@ class Metrics:
 
 @dataclass
 class Before:
-    """What the episodes before have come to: next sequence and life by UAV, newest version, number."""
+    """What the episodes before have come to: next sequence by UAV, newest version, number."""
 
     sequence: dict[int, int] = field(default_factory=dict)
-    life: dict[int, int] = field(default_factory=dict)
     version: int = 0
     number: int = 0
 
     def copy(self) -> Before:
-        return Before(dict(self.sequence), dict(self.life), self.version, self.number)
+        return Before(dict(self.sequence), self.version, self.number)
 
 
 class Evidence:
@@ -154,9 +152,8 @@ class Gathering:
             return
         before, i = self.before, m.uav
         answered = next((s.version for s in reversed(e.syncs) if i in s.uavs), e.before.version)
-        newest = answered if before.life.get(i, m.life) == m.life else before.version
-        e.records.append(Record(i, m.sequence, m.first, m.tick, m.version, (answered, newest)))
-        before.sequence[i], before.life[i] = m.sequence + 1, m.life
+        e.records.append(Record(i, m.sequence, m.first, m.tick, m.version, answered))
+        before.sequence[i] = m.sequence + 1
         e.reported[i] = max(e.reported[i], m.tick)
         moves = slice(max(m.first, 1), m.tick + 1)
         e.cells[m.first : m.tick + 1, i] = m.cells[:]
