@@ -217,8 +217,10 @@ class Replay:
         place = self._oldest + (u[:batch] * held).astype(np.int64)
         end = self.ends[place].astype(np.int64)
         present = self._present(end)
-        order = np.argsort(~present, axis=1, kind="stable")  # those who were not lost come first
-        uav = order[np.arange(batch), (u[batch:] * present.sum(axis=1)).astype(np.int64)]
+        uav = (u[batch:] * present.sum(axis=1)).astype(np.int64)
+        if not present.all():
+            order = np.argsort(~present, axis=1, kind="stable")  # those who were not lost come first
+            uav = order[np.arange(batch), uav]
         return self.rebuild(place, uav, np.zeros(0, np.float32))
 
     def rebuild(self, place: Ints, uav: Ints, weight: Floats) -> Sample:
@@ -260,27 +262,26 @@ class Replay:
         if self._events:
             bits = np.unpackbits(frame.astype(np.uint8), axis=1, count=self.world.law.cells.size)
             return bits.astype(np.float32)
-        last_visit = self._local_updates(row, uav, frame.astype(np.uint16), self.frame_tick[base].astype(np.int64))
+        last_visit = self._local_updates(row, uav, frame, self.frame_tick[base].astype(np.int64))
         s = None
         if self.world.config.world.initial_map == "random":
             s = np.stack([self._factors[int(e)] for e in self.episode[row].tolist()])
         return self.world.law.singles(last_visit, self.tick[row].astype(np.int64)[:, None], s)
 
     def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
-        """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers."""
+        """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers; in place."""
         tick, R = self.tick[row].astype(np.int64), last_visit.shape[1]
         batch, back = _ages(tick - since)
         team, own = self._team(row[batch] - back), uav[batch]
         cells = team[np.arange(batch.size), own]
         known = self.observer.sensed(cells, team, own)
         known[np.arange(batch.size), own] = True
-        where = np.where(known, self._column[team], R)  # column R: what was not sensed, or is not monitored
-        padded = np.empty((row.size, R + 1), np.uint16)
-        padded[:, :R] = last_visit
-        where += batch[:, None] * (R + 1)
-        seen = np.repeat((tick[batch] - back).astype(np.uint16), team.shape[1])
-        np.maximum.at(padded.ravel(), where.ravel(), seen)  # flat: NumPy takes three times as long over rows
-        return padded[:, :R]
+        column = self._column[team]
+        known &= column < R
+        at = np.nonzero(known)[0]
+        where, seen = batch[at] * R + column[known], (tick[batch] - back)[at].astype(np.uint16)
+        np.maximum.at(last_visit.ravel(), where, seen)  # flat: NumPy takes three times as long over rows
+        return last_visit
 
 
 def _ages(ticks: Ints) -> tuple[Ints, Ints]:
