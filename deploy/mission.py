@@ -27,6 +27,7 @@ from tmc.record import disk
 from tmc.record.errors import RecordError
 from tmc.record.seal import seal_log
 from tmc.wire import process
+from tmc.wire.fields import FRAME_LIMIT
 
 POLL = 0.1
 """Seconds between two looks at the processes."""
@@ -68,6 +69,9 @@ def check(config: Config, policy: bytes | None = None) -> World:
         who.require_policy(policy, world)
     elif not who.is_planner(config):
         check_view(config, view_shape(config, world.grid))
+        most = FRAME_LIMIT // (2 * 4 * max(world.law.cells.size, 1))  # two maps of float32 a transition, in one frame
+        if config.dqn.batch > most:
+            raise ConfigError(f"dqn.batch = {config.dqn.batch} is too large to send: choose {most} or less")
     return world
 
 

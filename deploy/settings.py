@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -44,12 +44,12 @@ def _dotted(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
-def add_options(parser: argparse.ArgumentParser, *, actors: bool = True) -> None:
-    """The options that missions share."""
+def add_options(parser: argparse.ArgumentParser, *, actors: bool = True, refused: Collection[str] = ()) -> None:
+    """The options that missions share. `refused`: those that the command takes only to say what to write instead."""
     group = parser.add_argument_group("settings of the mission")
     for option, key, metavar in OPTIONS:
         if actors or option != "--actors":
-            group.add_argument(option, metavar=metavar, help=key)
+            group.add_argument(option, metavar=metavar, help=argparse.SUPPRESS if option in refused else key)
     group.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="any other setting"
     )

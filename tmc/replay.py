@@ -269,7 +269,7 @@ class Replay:
         return self.world.law.singles(last_visit, self.tick[row].astype(np.int64)[:, None], s)
 
     def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
-        """The local update (Sec. II-D) of every tick after `since`: own cell, and the cells of sensed peers; in place."""
+        """The local update (Sec. II-D), in place, of every tick after `since`: own cell, and those of sensed peers."""
         tick, R = self.tick[row].astype(np.int64), last_visit.shape[1]
         batch, back = _ages(tick - since)
         team, own = self._team(row[batch] - back), uav[batch]

@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, metavar="S", help="default: %(default)s")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="J", help="processes to use")
     parser.add_argument("--json", action="store_true", help="print one line of JSON a row")
-    settings.add_options(parser, actors=False)
+    settings.add_options(parser, actors=False, refused=("--seed", "--episodes"))
 
 
 def main(args: argparse.Namespace) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, fields
 
 from tmc.kernel.config import Config, ConfigError, Network
@@ -15,8 +14,6 @@ KEY = "overfly"
 INPUT, OUTPUT = "observation", "q"
 """Names of the model's input, (batch, channels, height, width) float32, and output, (batch, 9) float32."""
 N_CHANNELS = 3
-MINIBATCH_LIMIT = 64 * 1024 * 1024
-"""Largest field of a minibatch, bytes: one frame on the wire."""
 
 
 class PolicyError(ValueError):
@@ -113,9 +110,6 @@ def check_view(config: Config, shape: tuple[int, int, int]) -> None:
             f"observation.near = {near} is larger than the view: choose {(min(shape[1:]) - 1) // 2} or less"
         )
     features(config.network, *shape[1:])
-    size, limit = 4 * math.prod(shape), MINIBATCH_LIMIT
-    if config.dqn.batch * size > limit:
-        raise ConfigError(f"dqn.batch = {config.dqn.batch} is too large to send: choose {limit // size} or less")
 
 
 def card_for(config: Config, grid: Grid, version: int, updates: int) -> PolicyCard:
