@@ -124,8 +124,8 @@ class Service:
     def _obey(self, message: m.Message) -> bool:
         """Act on a message of the TMC; True when the mission is over."""
         if isinstance(message, m.Minibatch):
-            self._ask()
             self._update(message)
+            self._ask()  # now: the TMC is at work for it while the other threads have nothing to do
         elif isinstance(message, m.Welcome) and message.run != self._run:
             raise EndpointError("another mission runs here now: start a learner for it with another --out")
         elif isinstance(message, m.Welcome):  # a TMC that has lost our requests, and perhaps its numbers

@@ -23,7 +23,7 @@ from learner.known import Known
 from learner.qnet import QNet, Shape
 from tmc.kernel.config import Config
 from tmc.kernel.grid import Grid
-from tmc.kernel.observation import Floats
+from tmc.kernel.observation import Floats, Ints
 from tmc.kernel.policy import card_for, view_shape
 
 NOTHING = np.zeros(0, np.int64), np.zeros(0, np.float32)
@@ -78,10 +78,11 @@ class Trainer:
         """One step of Adam on eq. (9), and theta- = theta when that is due. Raises TrainingError."""
         check(batch, self.shape)
         self._follow(batch.episodes)
-        y = self._target(batch)
-        action = torch.tensor(batch.action, dtype=torch.int64)
+        values, rest = self._known_values(batch)
+        o, action = laid_out(batch.observation), torch.tensor(batch.action, dtype=torch.int64)
         weight = torch.tensor(batch.weight) if batch.weight.size else None
-        gradient, q, loss = self._gradient(laid_out(batch.observation), action, y, weight)
+        passes = rest.size * (2 if self.config.dqn.double else 1)
+        gradient, q, y, loss = self._gradient(o, action, lambda: self._target(batch, values, rest), weight, passes)
         metrics = self._step(gradient, q, loss, y)
         if self.config.replay.priority:
             self._judged = batch.index, (q - y).abs().numpy()
@@ -90,23 +91,22 @@ class Trainer:
             self._copy()
         return metrics
 
-    @torch.no_grad()
-    def _target(self, batch: Batch) -> Tensor:
-        """y of eq. (8), of scaled rewards: `dqn.target`, with what theta- is known to say of o' looked up."""
-        reward = torch.tensor(batch.reward) * self.config.dqn.reward_scale
-        return reward + torch.tensor(batch.discount) * torch.from_numpy(self._values(batch))
-
-    def _values(self, batch: Batch) -> Floats:
-        """max_a' Q(o', a'; theta-) of each transition, computed only where it is not known. Shape (B,)."""
+    def _known_values(self, batch: Batch) -> tuple[Floats, Ints]:
+        """max_a' Q(o', a'; theta-) of each transition (B,), as far as it is known; and the rows where it is not."""
         values, known = self._known.look_up(batch.index)
-        rest = np.flatnonzero(~known)
+        return values, np.flatnonzero(~known)
+
+    @torch.no_grad()
+    def _target(self, batch: Batch, values: Floats, rest: Ints) -> Tensor:
+        """y of eq. (8), of scaled rewards: `dqn.target`; `values` (B,) are those of o', but for the rows `rest`."""
         if rest.size:
             o_next, allowed = laid_out(batch.next_observation(rest)), torch.tensor(batch.allowed[rest])
             choice = self.online(o_next) if self.config.dqn.double else None
             values[rest] = dqn.value(self.target(o_next), allowed, choice).numpy()
             if choice is None:  # a value that theta has chosen changes with every update
                 self._known.keep(batch.index[rest], values[rest])
-        return values
+        reward = torch.tensor(batch.reward) * self.config.dqn.reward_scale
+        return reward + torch.tensor(batch.discount) * torch.from_numpy(values)
 
     def judged(self) -> tuple[NDArray[np.int64], Floats]:
         """The transitions of the last update, by number, and |Q - y| of each; told once. Shapes (B,), or empty.
