@@ -25,6 +25,7 @@ from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
 from tmc.record import disk
 from tmc.record.errors import RecordError
+from tmc.record.reader import Log
 from tmc.record.seal import seal_log
 from tmc.wire import process
 from tmc.wire.fields import FRAME_LIMIT
@@ -90,7 +91,10 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{out / 'config.json'} cannot be read ({error}): the run cannot go on without it") from None
     with disk.open_held(journal, "rb"):
-        pass  # nobody writes it
+        log = Log(journal)  # nobody writes it
+    if log.damage and not log.still_open:
+        text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-1"
+        print(f"overfly: {text}, and `overfly log recover` says what else is in it", file=sys.stderr)
     file = flown_policy(out)
     policy = file.read_bytes() if file.exists() else None
     return check(build(values), policy), policy

@@ -28,6 +28,8 @@ INFANCY = 0.4
 """Seconds in which a TMC that was started has not sent anybody home yet: it takes longer to import what it needs."""
 OVERDUE = 5.0
 """Seconds after which a TMC that still runs needs whoever left: it stays for 3 s at most once everybody has."""
+FULL = 2**20
+"""Free bytes of a disk that counts as full when a process fails."""
 GRACE = 15.0
 """Seconds that processes get to leave before they are killed."""
 FINAL = {process.USAGE, process.FENCED}
@@ -125,6 +127,9 @@ class Supervisor:
         running.crashes = crashed + (0 if up > STEADY else running.crashes)
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         log = self.log_of(child.name)
+        if crashed and shutil.disk_usage(self.out).free < FULL:  # then its own sentence found no room either
+            mend = f"free some space, and go on with `overfly run --resume {self.out}`"
+            raise MissionFailed(f"{child.name} {how}: the disk that holds {self.out} is full; {mend}")
         if not child.restart or code in FINAL or running.crashes >= TRIES:
             raise MissionFailed(f"{child.name} {how}{self._reason(log)}; its output is in {log}")
         delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1]) if crashed else BACKOFF[0]

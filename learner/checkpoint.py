@@ -10,6 +10,7 @@ import hashlib
 import json
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,13 +108,13 @@ def _numbered(folder: Path) -> list[tuple[int, Path]]:
     return sorted(((int(n), path) for n, path in names if n.isdecimal()), reverse=True)
 
 
-def newest(folder: Path) -> Saved | None:
-    """The checkpoint with the most updates that can be read, or None; each damaged one is skipped with a warning."""
+def newest(folder: Path, tell: Callable[[str], None] = log.warning) -> Saved | None:
+    """The checkpoint with the most updates that can be read, or None; `tell` is told of each damaged one."""
     for _, path in _numbered(folder):
         try:
             return read(path)
         except CheckpointError as error:
-            log.warning("skipped: %s", error)
+            tell(f"skipped: {error}")
     return None
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import zmq
 
 from learner import checkpoint
-from learner.checkpoint import Saved
+from learner.checkpoint import CheckpointError, Saved
 from learner.intake import Intake
 from learner.trainer import UpdateMetrics, start
 from tmc.kernel.config import build
@@ -49,11 +49,16 @@ class Service:
 
     def learn(self, stop: Callable[[], bool]) -> bool:
         """The main loop; True when the mission came to its end, False when stopped. Leaves checkpoint and policy."""
-        saved = checkpoint.newest(self.out / "checkpoints")
+        folder, skipped = self.out / "checkpoints", list[str]()
+        saved = checkpoint.newest(folder, skipped.append)
+        if skipped and saved is None:
+            raise CheckpointError(f"no checkpoint in {folder} is sound: remove them all to begin with new weights")
         welcome = self._join(saved, stop)
         if welcome is None:
             return False
         self._prepare(welcome, saved)
+        for text in skipped:
+            self._warn(text)
         self._push()
         for _ in range(WINDOW):
             self._ask()
@@ -117,9 +122,12 @@ class Service:
         try:
             return sockets.receive_message(self.sock)
         except CodecError as error:
-            if self.log is not None:
-                self.log.log("warning", f"dropped a frame: {error}")
+            self._warn(f"dropped a frame: {error}")
             return None
+
+    def _warn(self, text: str) -> None:
+        if self.log is not None:
+            self.log.log("warning", text)
 
     def _obey(self, message: m.Message) -> bool:
         """Act on a message of the TMC; True when the mission is over."""

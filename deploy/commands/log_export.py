@@ -10,6 +10,7 @@ from pathlib import Path
 
 from deploy.progress import PLAIN_EVERY
 from tmc.analysis import replayfile
+from tmc.record.errors import RecordError
 from tmc.record.merge import merge
 from tmc.record.reader import run_files
 from tmc.wire.process import DONE, FAILED
@@ -38,7 +39,7 @@ def _merge(args: argparse.Namespace) -> int:
     files = {args.run.name.partition(".")[0]: args.run} if args.run.is_file() else run_files(args.run)
     folder = args.run.parent if args.run.is_file() else args.run
     word = _Progress()
-    out = args.out or folder / "merged.mcap"
+    out = _fresh(args.out) or folder / "merged.mcap"
     merged = merge(files, out, args.prefix, lambda done, of: word.say(f"message {done:,} of {of:,}"))
     word.clear()
     for path in merged.open:
@@ -52,7 +53,7 @@ def _merge(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     word = _Progress()
-    out = args.out or replayfile.default_path(args.run, args.episode)
+    out = _fresh(args.out) or replayfile.default_path(args.run, args.episode)
     made = replayfile.write(args.run, args.episode, out, word.say)
     word.clear()
     flown = made.flown
@@ -65,6 +66,13 @@ def _replay(args: argparse.Namespace) -> int:
     print(f"{made.path}: episode {args.episode}, ticks 0 to {flown.ticks:,}, {_size(made.path)}")
     print(f"{made.layout}: import it as the layout in Foxglove or Lichtblick")
     return FAILED if flown.damage else DONE
+
+
+def _fresh(out: Path | None) -> Path | None:
+    """The file that the user named, if any; RecordError rather than write over one."""
+    if out is not None and out.exists():
+        raise RecordError(f"{out} exists already: choose another --out, or remove it")
+    return out
 
 
 def _size(path: Path) -> str:

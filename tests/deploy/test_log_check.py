@@ -52,6 +52,15 @@ def test_check_of_damage_is_exit_code_1(run: Path, capsys: pytest.CaptureFixture
     assert re.search(r"^file .* VIOLATED: tmc\.mcap: .*, at byte \d+$", out, re.MULTILINE)
 
 
+def test_cat_of_damage_prints_what_is_sound_and_says_that_it_is_not_all(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damage(run / "tmc.mcap")
+    assert main(["log", "cat", str(run)]) == 1
+    said = capsys.readouterr()
+    assert re.fullmatch(r"overfly: this is not all of it: tmc\.mcap: .*, at byte \d+\n", said.err)
+
+
 def test_recover_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", "recover", str(run)]) == 0
     assert "sound and finished" in capsys.readouterr().out

@@ -96,6 +96,15 @@ def test_a_mistake_is_not_tried_again(supervise, code: int) -> None:
     assert supervisor.restarts() == {}
 
 
+def test_a_full_disk_is_named_at_once(supervise, monkeypatch) -> None:
+    """The process's own sentence finds no room in its file, and to start it again is no help."""
+    monkeypatch.setattr(supervisors, "FULL", 2**62)
+    supervisor = supervise(python("tmc", "import sys; sys.exit(1)", leads=True))
+    with pytest.raises(MissionFailed, match="is full; free some space, and go on with `overfly run --resume"):
+        watch_until(supervisor, lambda: False)
+    assert supervisor.restarts() == {}
+
+
 def test_the_mission_ends_with_its_leader(supervise) -> None:
     supervisor = supervise(python("tmc", "", restart=False, leads=True))
     until = time.monotonic() + 10

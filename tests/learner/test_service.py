@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from learner.checkpoint import CheckpointError
 from learner.service import Service
 from tmc.kernel.config import build, flat
 from tmc.kernel.world import World
@@ -37,5 +38,18 @@ def test_a_welcome_to_another_mission_ends_the_learner(tmp_path: Path) -> None:
         with pytest.raises(EndpointError, match="another mission runs here now"):
             service._obey(other)
         assert not service._obey(first)
+    finally:
+        service.close()
+
+
+def test_damaged_checkpoints_are_not_passed_over_for_new_weights(tmp_path: Path) -> None:
+    """What was learned would be gone without a word, and the team flies on by what is not trained."""
+    folder = tmp_path / "R" / "checkpoints"
+    folder.mkdir(parents=True)
+    (folder / "checkpoint-7.safetensors").write_bytes(b"not a checkpoint")
+    service = Service(f"ipc://{tmp_path}/sync", tmp_path / "R")
+    try:
+        with pytest.raises(CheckpointError, match=r"no checkpoint in .* is sound: remove them all"):
+            service.learn(lambda: False)
     finally:
         service.close()

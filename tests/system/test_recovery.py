@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 
 from deploy.cli import main
 from tests.command import LINE
@@ -20,6 +21,7 @@ from tmc.analysis.check import check
 from tmc.journal import journal_in
 from tmc.kernel.config import Journal
 from tmc.record.facts import digest
+from tmc.record.frames import frames
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
@@ -164,3 +166,23 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
         said = capsys.readouterr()
         assert sentence in said.err and len(said.err.splitlines()) == 1 and said.out == ""
     assert list(empty.iterdir()) == []
+
+
+def test_a_damaged_journal_is_gone_on_with_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bit of the length of a record: the file seems to be cut there, and goes on."""
+    out = tmp_path / "R"
+    short = ("--lockstep", "--ticks", "60", "--episodes", "4", "--no-pictures")
+    assert main(["fly", "planner:greedy", *short, "--out", str(out)]) == 0
+    with (out / "tmc.mcap").open("rb") as file:
+        chunks = [at for at, opcode, _ in frames(file) if opcode == Opcode.CHUNK]
+    data = bytearray((out / "tmc.mcap").read_bytes())
+    data[chunks[0] + 5] ^= 1
+    (out / "tmc.mcap").unlink()
+    (out / "tmc.mcap.active").write_bytes(data)
+    (out / "run.json").unlink()
+    assert main(["log", "check", str(out)]) == 1
+    capsys.readouterr()
+    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0
+    said = capsys.readouterr().err
+    assert "the run goes on from before that; the damaged file is kept as tmc.mcap.active.damaged-1" in said
+    assert (out / "tmc.mcap.active.damaged-1").read_bytes() == bytes(data) and check(out).good

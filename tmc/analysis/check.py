@@ -12,7 +12,6 @@ from tmc.analysis.reckoning import Truth, truth
 from tmc.analysis.setting import world_of
 from tmc.analysis.statelaw import STATE, states
 from tmc.analysis.verdict import Found, Violation
-from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.reader import Entry, Log, run_files
 
@@ -137,7 +136,7 @@ def _sound(log: Log, row: Row) -> Iterator[Entry]:
 
 def _judge_file(log: Log, result: Result) -> None:
     """Damage, and what is known to be lost; a journal that a kill cut off, or that still grows, is good as it is."""
-    left = log.path.name.endswith(ACTIVE) and log.cut
+    left = log.still_open
     lost = log.lost.get("lost")
     faults = [log.damage] if log.damage and not left else []
     faults += [f"lost: {lost}"] if lost else []

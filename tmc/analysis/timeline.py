@@ -16,7 +16,6 @@ from tmc.analysis.setting import world_of
 from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
-from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, decode, run_files
 
@@ -76,7 +75,7 @@ def read(folder: Path, episode: int, show: Callable[[str], None] = lambda _: Non
         if number % EVERY == 0:
             show(f"reading {path.name}: {number:,} messages")
     else:
-        gathered.damage = None if path.name.endswith(ACTIVE) and log.cut else log.damage
+        gathered.damage = None if log.still_open else log.damage
     return gathered.timeline(folder, tuple(notes))
 
 

@@ -21,12 +21,11 @@ def left_behind(path: Path, resume: bool) -> Path | None:
     """The file that an earlier life left at `path`, to resume; RecordError rather than write over it."""
     if path.suffix != ".mcap":
         raise RecordError(f"{path} must end in .mcap: correct the name of the log")
-    for old in (path.with_name(path.name + ACTIVE), path):
-        if resume and old.is_file():
-            return old
-        if old.exists():
-            raise RecordError(f"{old} exists already: choose a new run folder, or resume the run that is in it")
-    return None
+    there = [old for old in (path.with_name(path.name + ACTIVE), path) if old.exists()]
+    if there and not (resume and there[0].is_file()):
+        raise RecordError(f"{there[0]} exists already: choose a new run folder, or resume the run that is in it")
+    # An empty file holds nothing: what stands beside it is what was left.
+    return next((old for old in there if old.stat().st_size), there[0] if there else None)
 
 
 def open_held(path: Path, mode: str) -> Any:

@@ -29,11 +29,11 @@ _DATA = frozenset((Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATT
 
 
 class DamageError(Exception):
-    """The file is not sound from here on. `cut`: it just ends too early, as after a kill."""
+    """The file is not sound from here on. `cut`: it just ends too early, at byte `size`, as after a kill."""
 
-    def __init__(self, at: int, why: str, cut: bool = False) -> None:
+    def __init__(self, at: int, why: str, cut: bool = False, size: int = 0) -> None:
         super().__init__(f"{why}, at byte {at}")
-        self.cut = cut
+        self.at, self.cut, self.size = at, cut, size
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ def frames(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
         head = file.read(_HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, size)
         if at + _HEAD.size + length > size:
-            raise DamageError(at, "it is cut", cut=True)
+            raise DamageError(at, "it is cut", cut=True, size=size)
         body = file.read(length)
         if opcode == Opcode.FOOTER:
             _check_end(file, at, body, zlib.crc32(body[:-4], zlib.crc32(head, crc)), summary)

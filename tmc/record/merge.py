@@ -12,7 +12,6 @@ from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
-from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.export import Export
 from tmc.record.frames import DamageError, Raw, contents
@@ -78,7 +77,7 @@ def merge(
             written += 1
             show(written, total)
     logs = [source.log for source in sources]
-    still_open = {log.path for log in logs if log.path.name.endswith(ACTIVE) and log.cut}
+    still_open = {log.path for log in logs if log.still_open}
     damage += [log.damage for log in logs if log.damage and log.path not in still_open]
     return Merged(out, len(sources), written, tuple(damage), tuple(sorted(still_open)))
 

@@ -18,6 +18,7 @@ from mcap.records import Attachment, Metadata
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.frames import MAGIC, RECOVERED, DamageError, Raw, contents
+from tmc.record.salvage import goes_on
 from tmc.record.schemas import message_class
 
 _LOG_NAME = re.compile(rf"(tmc|learner|uav-\d+)\.mcap({re.escape(ACTIVE)})?")
@@ -75,6 +76,11 @@ class Log:
         return not self._finished and (self._damage is None or self._damage.cut)
 
     @property
+    def still_open(self) -> bool:
+        """True for a file that still grows, or that a kill cut off, and is sound so far."""
+        return self.path.name.endswith(ACTIVE) and self.cut
+
+    @property
     def finished(self) -> bool:
         """True when the file was closed in order and is sound to its end."""
         self._know()
@@ -98,6 +104,10 @@ class Log:
         told = [item.metadata for item in head if isinstance(item, Metadata) and item.name == RECOVERED]
         return {key: "; ".join(facts[key] for facts in told) for key in (told[0] if told else {})}
 
+    def notes(self) -> list[Metadata]:
+        """All metadata records, of each life of the process."""
+        return [item for item in self._items() if isinstance(item, Metadata)]
+
     def attachments(self) -> list[Attachment]:
         """The files within the file: name, media_type, data."""
         return [item for item in self._items() if isinstance(item, Attachment)]
@@ -116,6 +126,8 @@ class Log:
                     yield item
         except DamageError as error:
             damage = error
+            if error.size and goes_on(self.path, error.at, error.size):
+                damage = DamageError(error.at, "the length of a record is damaged")
         self._damage, self._finished, self._read = damage, finished, True
 
 
@@ -158,13 +170,18 @@ def read(path: str | os.PathLike[str], topics: Collection[str] | None = None) ->
 def run_files(folder: str | os.PathLike[str]) -> dict[str, Path]:
     """{process: its log} of a run, `tmc` and `learner` first; RecordError when the folder holds none.
 
-    Where both names exist, a resumed log is just taking over from the finished one, and holds all of it.
+    Where both names exist, a resumed log is just taking over from the finished one, and holds all of it, unless it is
+    empty.
     """
     folder = Path(folder)
     paths = sorted(p for p in folder.glob("*.mcap*") if _LOG_NAME.fullmatch(p.name))
     if not paths:
         raise RecordError(f"{folder} holds no logs of a run (tmc.mcap and others): give the folder of a run")
-    found = {path.name.partition(".")[0]: path for path in paths}
+    found: dict[str, Path] = {}
+    for path in paths:
+        name = path.name.partition(".")[0]
+        if name not in found or path.stat().st_size or not found[name].stat().st_size:
+            found[name] = path
     return dict(sorted(found.items(), key=lambda item: (item[0].startswith("uav"), item[0] != "tmc", item[0])))
 
 

@@ -24,10 +24,15 @@ def copy(old: Path, new: LogWriter) -> None:
     log = Log(old)
     if log.lost:
         new.note(RECOVERED, log.lost)
+    for note in log.notes():
+        if note.name != RECOVERED:
+            new.note(note.name, note.metadata)
     for attachment in log.attachments():
         new.attach(attachment.name, attachment.media_type, attachment.data)
     for raw in log.raw():
         new.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
-    if log.damage is not None and not log.cut:
+    if log.damage is not None and not log.still_open:
         names = (old.with_name(f"{old.name}.damaged-{n}") for n in count(1))
-        next(name for name in names if not name.exists()).hardlink_to(old)
+        kept = next(name for name in names if not name.exists())
+        kept.hardlink_to(old)
+        new.log("error", f"{log.damage}: this life goes on from before that; the file is kept as {kept.name}")

@@ -54,6 +54,16 @@ def salvage(path: Path, what: str = "", show: Show = unseen) -> tuple[Findings, 
     return found, scan.items()
 
 
+def goes_on(path: Path, at: int, size: int) -> bool:
+    """Whether a chunk or an attachment that a CRC vouches for stands behind byte `at` of the first `size`.
+
+    Then a record that seems to end behind them has a damaged length: the file is not cut.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
+        scan = _Scan(data, Findings(), True, lambda _: None)
+        return scan._next(at + 1) < size
+
+
 class _Scan:
     """One pass over the bytes of a file; `active`: its name says that it was never finished."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import pytest
@@ -207,6 +208,35 @@ def write(folder: Path, whole: Whole, data: bytes) -> Path:
     path = folder / whole.name
     path.write_bytes(data)
     return path
+
+
+@PROPERTY
+@given(close=st.booleans(), what=harms)
+@example(close=False, what=[(zeros, 243, b"abc")])
+def test_a_log_that_is_gone_on_with_loses_nothing_in_silence(
+    wholes: dict[bool, Whole], tmp_path: Path, close: bool, what: list[Any]
+) -> None:
+    """All that is sound is in the new file; or the damaged one is kept, and the new one says so."""
+    whole, folder = wholes[close], Path(mkdtemp(dir=tmp_path))
+    data, first, _ = harm(whole, what)
+    old, copied = write(folder, whole, data), folder / "copy.mcap.active"
+    copied.write_bytes(data)
+    try:
+        with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}, resume=True):
+            pass
+    except RecordError:
+        assert old.read_bytes() == data  # it does not begin as a log does
+        return
+    found, kept = messages_of(folder / "tmc.mcap"), list(folder.glob("tmc.mcap*.damaged-1"))
+    told = [data for topic, _, _, data in found if topic == "/log" and b".damaged-1" in data]
+    assert len(told) == len(kept) and Log(folder / "tmc.mcap").finished
+    assert found[: flushed_before(whole, first)] == whole.messages[: flushed_before(whole, first)]
+    if not kept and found != whole.messages:
+        try:
+            sound = recover(copied).found.messages
+        except RecordError:
+            sound = 0
+        assert len(found) == sound
 
 
 def test_a_finished_file_needs_no_recovery(wholes: dict[bool, Whole], tmp_path: Path) -> None:

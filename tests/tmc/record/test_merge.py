@@ -194,6 +194,11 @@ def test_the_command(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert cli.main(["log", "merge", str(flown), "--prefix", "A/", "--out", str(out)]) == 0
     said = capsys.readouterr()
     assert said.out.startswith(f"{out}: {len(of_merged(out)):,} messages of {N + 1} files") and not said.err
+    before = out.read_bytes()
+    for view in ("merge", "replay"):  # a file that the user names is never written over
+        assert cli.main(["log", view, str(flown), "--out", str(out)]) == 2
+        assert capsys.readouterr().err == f"overfly: {out} exists already: choose another --out, or remove it\n"
+    assert out.read_bytes() == before
     assert cli.main(["log", "merge", str(out), "--prefix", "B", "--out", str(tmp_path / "B.mcap")]) == 0
     assert {row[1].partition("/A/")[0] for row in of_merged(tmp_path / "B.mcap")} == {"/B"}  # type: ignore[attr-defined]
     capsys.readouterr()

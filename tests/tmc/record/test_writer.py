@@ -13,7 +13,7 @@ import pytest
 from tmc.kernel.config import Journal
 from tmc.record import builders, schemas
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, read
+from tmc.record.reader import Log, read, run_files
 from tmc.record.writer import LogWriter
 
 LAZY = Journal(flush=60.0)
@@ -241,7 +241,8 @@ def test_resume_goes_on_after_a_kill(tmp_path):
     assert [e.message.tick for e in read(path)] == [0, 2, 3]
 
 
-def test_resume_keeps_a_file_whose_middle_is_damaged(tmp_path):
+@pytest.mark.parametrize("place", [60, 2], ids=["in a chunk", "in the length of one"])
+def test_resume_keeps_a_file_whose_middle_is_damaged_and_says_so(tmp_path, place):
     path, active = tmp_path / "tmc.mcap", tmp_path / "tmc.mcap.active"
     first = writer(path)
     sizes = []
@@ -251,12 +252,47 @@ def test_resume_keeps_a_file_whose_middle_is_damaged(tmp_path):
         sizes.append(active.stat().st_size)
     first._give_up()
     data = bytearray(active.read_bytes())
-    data[sizes[0] + 60] ^= 1
+    data[sizes[0] + place] ^= 1  # with 2: a length that seems to end behind the file
     active.write_bytes(data)
+    assert not Log(active).still_open
     with writer(path, resume=True):
         pass
-    assert [e.message.tick for e in read(path)] == [0]
+    assert [e.message.tick for e in read(path, ["/tmc/sync"])] == [0]
+    (told,) = (e.message.message for e in read(path, ["/log"]))
+    assert f"at byte {sizes[0]}" in told and "tmc.mcap.active.damaged-1" in told
     assert (tmp_path / "tmc.mcap.active.damaged-1").read_bytes() == bytes(data)
+
+
+def test_resume_of_a_finished_file_that_was_cut_keeps_it(tmp_path):
+    path = tmp_path / "tmc.mcap"
+    with writer(path) as first:
+        for t in range(50):
+            first.write("/tmc/sync", sync(t))
+            first.flush()
+    os.truncate(path, path.stat().st_size // 2)
+    size = path.stat().st_size
+    with writer(path, resume=True):
+        pass
+    assert (tmp_path / "tmc.mcap.damaged-1").stat().st_size == size
+    assert any("tmc.mcap.damaged-1" in e.message.message for e in read(path, ["/log"]))
+
+
+def test_an_empty_file_takes_no_sound_ones_place(tmp_path):
+    path, active = tmp_path / "tmc.mcap", tmp_path / "tmc.mcap.active"
+    with writer(path) as first:
+        first.write("/tmc/sync", sync(7))
+    active.touch()
+    assert run_files(tmp_path) == {"tmc": path}
+    with writer(path, resume=True):
+        pass
+    assert [e.message.tick for e in read(path)] == [7] and names(tmp_path) == ["tmc.mcap"]
+
+
+def test_what_each_life_said_of_itself_is_kept(tmp_path):
+    path = tmp_path / "tmc.mcap"
+    for _ in range(3):
+        writer(path, resume=True).close()
+    assert [note.name for note in Log(path).notes()] == ["overfly/tmc"] * 3
 
 
 def test_resume_of_nothing_is_a_fresh_start(tmp_path):
