@@ -115,14 +115,15 @@ def _learning_curve(axes: Any, learning: Learning) -> None:
     lines = axes.plot(x, _thin(learning.loss), color=style.BLUE, linewidth=0.7, label="loss (left)")
     if (learning.loss > 0).any():
         _log_scale(axes)
+    over = axes
     if np.isfinite(learning.q_mean).any():
-        right = axes.twinx()
+        over = right = axes.twinx()
         right.spines["top"].set_visible(False)
         right.set_ylabel("Q value (rewards as scaled)")
         lines += right.plot(x, _thin(learning.q_mean), color=style.ORANGE, linewidth=1.2, label="mean Q (right)")
         target = _thin(learning.target_mean)
         lines += right.plot(x, target, color=style.BLACK, linewidth=0.8, linestyle=":", label="mean target (right)")
-    axes.legend(handles=lines, frameon=False, fontsize=8)
+    over.legend(handles=lines, frameon=False, fontsize=8)  # it keeps clear of the lines of its own axes
 
 
 def _log_scale(axes: Any) -> None:

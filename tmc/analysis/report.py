@@ -74,8 +74,8 @@ def _facts(s: Summary) -> Iterator[str]:
     which = f"episode {last.episode}"
     earlier = "" if s.first == last else f", {s.first.reward:.3f} in episode {s.first.episode}"
     yield _row("Reward", f"{last.reward:.3f} a UAV a tick in {which}{earlier}")
-    causes = f"by UAVs {s.blocked_uav:,}, obstacles {s.blocked_obstacle:,}, edge {s.blocked_grid:,}"
-    yield _row("Blocked", f"{s.blocked:,} of {s.moves:,} moves ({s.blocked_share:.2%}): {causes}")
+    causes = f"UAVs {s.blocked_uav:,}, obstacles {s.blocked_obstacle:,}, edge {s.blocked_grid:,}"
+    yield _row("Blocked", f"{s.blocked_share:.2%} of {s.moves:,} moves: {causes}")
     roads = f"{last.on_road:.1%} of ticks over road, {last.coverage:.1%} of road cells visited"
     yield _row("Roads", f"{roads} in {which}")
     if last.events_appeared is not None:

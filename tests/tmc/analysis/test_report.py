@@ -45,7 +45,7 @@ def test_it_says_the_numbers(fly):
     report = text(s)
     assert f"{s.last.per_cell:.4f}" in report and f"{s.last.times_bound:.3f}" in report
     assert "1 of 1, of 60 ticks of 60 s; seed 3" in report
-    assert f"{s.blocked:,} of 180 moves" in report
+    assert f"{s.blocked_share:.2%} of 180 moves: UAVs {s.blocked_uav}," in report
     assert "Pictures" not in report and "Events" not in report and "Learning" not in report
 
 
