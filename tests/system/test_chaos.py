@@ -75,9 +75,9 @@ def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly
 
 
 @pytest.mark.slow
-def test_losses_are_seen_when_there_are_some(overfly: Overfly, tmp_path: Path) -> None:
+@pytest.mark.parametrize("options", [("--mode", "fly", "--episodes", "2", *SHORT), LIGHT], ids=["fly", "train"])
+def test_losses_are_seen_when_there_are_some(overfly: Overfly, tmp_path: Path, options: tuple[str, ...]) -> None:
     """The counter-check. What was kept shows it too: the last commit is older than what was acknowledged."""
-    options = ("--mode", "fly", "--ack-early", "--kills", "12", "--set", "journal.commit=0.2", *SHORT)
-    row = storm(overfly, *options, "--episodes", "2", "--keep", str(tmp_path / "kept"), code=1)
+    row = storm(overfly, "--ack-early", "--kills", "12", *options, "--keep", str(tmp_path / "kept"), code=1)
     assert row["lost"] > 0 and any("were acknowledged and are lost" in fault for fault in row["faults"])
     assert row["folder"] == str(tmp_path / "kept") and "did not survive" in (tmp_path / "kept/diary.txt").read_text()
