@@ -104,13 +104,13 @@ class Log:
         told = [item.metadata for item in head if isinstance(item, Metadata) and item.name == RECOVERED]
         return {key: "; ".join(facts[key] for facts in told) for key in (told[0] if told else {})}
 
-    def notes(self) -> list[Metadata]:
-        """All metadata records, of each life of the process."""
-        return [item for item in self._items() if isinstance(item, Metadata)]
+    def extras(self) -> list[Metadata | Attachment]:
+        """What there is besides messages: metadata records, of each life of the process, and attachments."""
+        return [item for item in self._items() if isinstance(item, Metadata | Attachment)]
 
     def attachments(self) -> list[Attachment]:
         """The files within the file: name, media_type, data."""
-        return [item for item in self._items() if isinstance(item, Attachment)]
+        return [item for item in self.extras() if isinstance(item, Attachment)]
 
     def _know(self) -> None:
         if not self._read:

@@ -79,9 +79,13 @@ def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show
         if target.exists() and not (in_place and target == path):
             mend = "remove the one that you do not want" if in_place else "choose another --out, or remove it"
             raise RecordError(f"{target} exists already: {mend}")
-        kept = keep if in_place and not found.whole else _nothing
+
+        def before_it_is_replaced(_new: Path) -> None:
+            if in_place and not found.whole:
+                keep(path)
+
         items = chain(_mark(found), salvage(path, "writing what is sound in", show)[1])
-        rewrite.write(target, Journal().chunk, found.profile, items, lambda _new: kept(path))
+        rewrite.write(target, Journal().chunk, found.profile, items, before_it_is_replaced)
         if in_place and target != path:
             path.unlink()
     return Recovery(path, target, found)
@@ -105,14 +109,12 @@ def survey(path: Path, show: Show) -> Findings:
     return found
 
 
-def keep(path: Path) -> None:
-    """Keep a damaged file under another name: there may be more in it than we can read."""
+def keep(path: Path) -> Path:
+    """Keep a damaged file under another name, which is returned: there may be more in it than we can read."""
     names = (path.with_name(f"{path.name}.damaged-{n}") for n in count(1))
-    next(name for name in names if not name.exists()).hardlink_to(path)
-
-
-def _nothing(_path: Path) -> None:
-    """There is nothing to keep."""
+    kept = next(name for name in names if not name.exists())
+    kept.hardlink_to(path)
+    return kept
 
 
 def _mark(found: Findings) -> Iterator[Item]:

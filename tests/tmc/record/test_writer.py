@@ -292,7 +292,7 @@ def test_what_each_life_said_of_itself_is_kept(tmp_path):
     path = tmp_path / "tmc.mcap"
     for _ in range(3):
         writer(path, resume=True).close()
-    assert [note.name for note in Log(path).notes()] == ["overfly/tmc"] * 3
+    assert [note.name for note in Log(path).extras()] == ["overfly/tmc"] * 3
 
 
 def test_resume_of_nothing_is_a_fresh_start(tmp_path):
