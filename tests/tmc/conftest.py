@@ -100,7 +100,8 @@ class Mission:
         config = build({"training.episodes": 1, **values})
         self.world, self.radio = World(config, road_map), radio
         fixed = b"policy" if config.team.pilot == "policy" and not learning else None
-        self.station = Station(self.world, "run", learning=learning, policy=fixed)
+        tracks = "" if radio else "a table"
+        self.station = Station(self.world, "run", learning=learning, policy=fixed, tracks=tracks)
         self.N, self.T = config.team.size, config.training.ticks
         self.observer = Observer(self.world)
         self.table = TrackTable(self.N, self.T)
