@@ -93,7 +93,7 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
     with disk.open_held(journal, "rb"):
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
-        text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-1"
+        text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
         print(f"overfly: {text}, and `overfly log recover` says what else is in it", file=sys.stderr)
     file = flown_policy(out)
     policy = file.read_bytes() if file.exists() else None
