@@ -57,7 +57,10 @@ class Leg:
 
 
 class Pilot:
-    """UAV `uav` of a world. `make_decider` turns the bytes of a policy file into a Decider; a planner needs none."""
+    """UAV `uav` of a world. `make_decider` turns the bytes of a policy file into a Decider; a planner needs none.
+
+    `clock`: the wall clock in ns that records are stamped with; 0 where there is none.
+    """
 
     def __init__(
         self,
@@ -68,11 +71,12 @@ class Pilot:
         observer: Observer,
         make_decider: Callable[[bytes], Decider],
         planner: Decider | None = None,
+        clock: Callable[[], int] = lambda: 0,
     ) -> None:
         self.world, self.uav, self.life, self.observer = world, uav, life, observer
         self.config, self.law = world.config, world.law
         self.airspace = Airspace(uav, self.config.team.size, world.grid, observer.sensing, tracks)
-        self.reward = RewardLaw(self.config, world.law.q)
+        self.reward, self._clock = RewardLaw(self.config, world.law.q), clock
         self.decider, self._make_decider, self._planner = planner, make_decider, planner
         self._valued: Valued | None = None
         """The policy, where each move is told with what it is worth (`replay.priority`)."""
@@ -214,6 +218,7 @@ class Pilot:
             np.array(leg.rewards, "<f4"),
             EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
             np.nan_to_num(np.array(leg.values, "<f4")) if leg.values else NONE,  # a message takes finite numbers only
+            self._clock(),
         )  # fmt: skip
         self.spool.append(self.pending)
         self.sequence += 1

@@ -137,7 +137,7 @@ class Service:
         who = config.team.pilot
         planner: Decider | None = PlannerDecider(world, who) if who.startswith(PREFIX) else None
         planner = witness.watch(planner) if witness and planner else planner
-        return Pilot(world, self.uav, self.life, tracks, observer, decider, planner), radio
+        return Pilot(world, self.uav, self.life, tracks, observer, decider, planner, time.time_ns), radio
 
     # The radio.
 

@@ -161,7 +161,7 @@ class Service:
 
     def _push(self) -> bytes:
         version, model = self.trainer.policy()
-        sockets.send(self.sock, m.PolicyPush(version, self.trainer.updates, self._loss, model))
+        sockets.send(self.sock, m.PolicyPush(version, self.trainer.updates, self._loss, model, time.time_ns()))
         return model
 
     def _report(self, metrics: UpdateMetrics, minibatch: m.Minibatch) -> None:

@@ -17,15 +17,17 @@ from tmc.wire.messages import Record
 
 @dataclass(frozen=True)
 class Entry:
-    """A journal entry: the topic, and the fields of its schema."""
+    """A journal entry: the topic, and the fields of its schema. `sent`: the wall clock of whoever sent it, in ns; 0
+    where that is the TMC."""
 
     topic: str
     values: dict[str, Any]
+    sent: int = 0
 
 
 def flight_record(record: Record) -> Entry:
     """A record that was accepted."""
-    return Entry(uav_topic(record.uav, "record"), {"record": record})
+    return Entry(uav_topic(record.uav, "record"), {"record": record}, record.sent)
 
 
 def exchange(flight: Flight, done: Exchange, policy: int) -> list[Entry]:
@@ -79,8 +81,8 @@ def episode(flight: Flight, phase: str, epsilon: float, steps: int, updates: int
     })  # fmt: skip
 
 
-def policy(version: int, updates: int, loss: float, model: bytes, *, last: bool) -> Entry:
+def policy(version: int, updates: int, loss: float, model: bytes, sent: int, *, last: bool) -> Entry:
     """A policy that was accepted; only the mission's last one with its model, since thousands of them may come."""
     digest = hashlib.sha256(model).hexdigest()
     values = {"version": version, "updates": updates, "sha256": digest, "loss": loss, "model": model if last else b""}
-    return Entry("/learner/policy", values)
+    return Entry("/learner/policy", values, sent)

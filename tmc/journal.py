@@ -56,7 +56,7 @@ class Journal:
         if outbox.entries and self._since is None:
             self._since = time.monotonic()
         for entry in outbox.entries:
-            self.writer.write(entry.topic, self._message(entry))
+            self.writer.write(entry.topic, self._message(entry), entry.sent or None)
         for level, text in outbox.notes:
             self.writer.log(level.lower(), text)
 

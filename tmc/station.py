@@ -290,15 +290,15 @@ class Station:
         if push.version <= self.policies.newest:
             self.reject(sender, "refused", f"policy {push.version} is not newer than {self.policies.newest}")
             return
-        self.take_policy(push.version, push.model, push.updates, push.loss)
+        self.take_policy(push.version, push.model, push.updates, push.loss, push.sent)
         self.send(sender, m.Ack(push.version))
         self._try_begin()
 
-    def take_policy(self, version: int, model: bytes, updates: int, loss: float) -> None:
+    def take_policy(self, version: int, model: bytes, updates: int, loss: float, sent: int = 0) -> None:
         """A newer policy is here, or, when a journal is played, was: `model` is empty where the file is gone."""
         self.policies.take(version, model, (member.policy for member in self.roster))
         self.loss = loss
-        self.out.entries.append(entries.policy(version, updates, loss, model, last=self._ended))
+        self.out.entries.append(entries.policy(version, updates, loss, model, sent, last=self._ended))
 
     def _policy_request(self, sender: str, request: m.PolicyRequest, _now: float) -> None:
         found = self.policies.find(request.version)

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from tmc.record.facts import digest
+from tmc.record.reader import Log
 
 GREEDY = ("fly", "planner:greedy", "--no-pictures")
 
@@ -42,6 +43,16 @@ def test_the_learner_draws_one_minibatch_a_tick(here, trained) -> None:
     last = json.loads(updates[-1])["message"]
     # 120 ticks; 60 transitions are in at tick 30: at tick 20 the 3-step sums of the last two ticks are not known yet.
     assert int(last["updates"]) == 90
+
+
+def test_the_log_knows_when_who_sent_something_made_it(trained) -> None:
+    """publish_time: the wall clock of the UAV, of the learner, or of the TMC itself."""
+    under_way: dict[str, list[int]] = {}
+    for raw in Log(trained(2) / "tmc.mcap").raw():
+        under_way.setdefault(raw.schema, []).append(raw.log_time - raw.publish_time)
+    for told in ("overfly.FlightRecord", "overfly.Policy"):
+        assert all(0 < ns < 120e9 for ns in under_way[told]), told
+    assert set(under_way["overfly.TeamMetrics"]) == set(under_way["overfly.Sync"]) == {0}
 
 
 def test_a_run_folder_that_exists_is_refused(here, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ _CODES = {"<u2": "H", "u1": "B", "<f4": "f"}
 
 
 def flight_record(record: Record) -> Any:
-    """The overfly.FlightRecord of a Record; `to_record` gives back the very same."""
+    """The overfly.FlightRecord of a Record, all but `sent`; `to_record` gives back the very same."""
     numbers = {name: getattr(record, name) for name in _NUMBERS}
     return FlightRecord(**numbers, **{name: getattr(record, name).tolist() for name in _ARRAYS})
 

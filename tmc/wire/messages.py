@@ -83,7 +83,8 @@ class Record(Message):
     reckons them by its own map) have one entry a move, so one less than `cells` when the record starts at tick 0.
     `seen_tick`, `seen_cell`: peers sensed, one entry a sighting. `version`: the map that the UAV flew by. `values`:
     where a policy flies and `replay.priority` is not 0, two entries a move, Q(o_t, a_t) and max_a Q(o_t, a) over the
-    actions that the UAV may choose; else empty.
+    actions that the UAV may choose; else empty. `sent`: the wall clock of the UAV when it made the record, ns since
+    1970, for the log; 0 where there is no clock.
     """
 
     uav: int = f.integer(0, 65_535)
@@ -101,6 +102,7 @@ class Record(Message):
     seen_tick: Array = f.array("<u2", 1_000_000)
     seen_cell: Array = f.array("<u2", 1_000_000)
     values: Array = f.array("<f4", 131_070, empty=True)
+    sent: int = f.integer(0, 2**63 - 1, default=0)
 
 
 @dataclass(frozen=True)
@@ -197,12 +199,13 @@ class Minibatch(Message):
 
 @dataclass(frozen=True)
 class PolicyPush(Message):
-    """The learner's policy after `updates` updates; a version that is not newer is refused."""
+    """The learner's policy after `updates` updates; a version that is not newer is refused. `sent`: as in `Record`."""
 
     version: int = f.integer(1, 2**62)
     updates: int = f.integer(0, 2**62)
     loss: float = f.real(-1e30, 1e30)
     model: bytes = f.blob(64 * 1024 * 1024)
+    sent: int = f.integer(0, 2**63 - 1, default=0)
 
 
 @dataclass(frozen=True)
