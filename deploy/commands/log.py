@@ -106,7 +106,7 @@ def _cat(args: argparse.Namespace) -> int:
         for entry in log.entries(args.topic):
             wanted.discard(entry.topic)
             body = MessageToDict(entry.message, preserving_proto_field_name=True)
-            head = {"topic": entry.topic, "log_time": entry.log_time, "sequence": entry.sequence}
+            head = {name: getattr(entry, name) for name in ("topic", "log_time", "publish_time", "sequence")}
             print(json.dumps(head | {"message": body}))
         damage += [log.damage] if log.damage and not log.still_open else []
     for text in damage:

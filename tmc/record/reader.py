@@ -174,7 +174,7 @@ def run_files(folder: str | os.PathLike[str]) -> dict[str, Path]:
     empty.
     """
     folder = Path(folder)
-    paths = sorted(p for p in folder.glob("*.mcap*") if _LOG_NAME.fullmatch(p.name))
+    paths = sorted(p for p in folder.glob("*.mcap*") if _LOG_NAME.fullmatch(p.name) and p.is_file())
     if not paths:
         raise RecordError(f"{folder} holds no logs of a run (tmc.mcap and others): give the folder of a run")
     found: dict[str, Path] = {}

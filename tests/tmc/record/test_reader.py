@@ -1,6 +1,7 @@
 """The reader: a file may be cut anywhere or damaged anywhere, and still nothing is invented."""
 
 import io
+import os
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -180,6 +181,8 @@ def test_run_files(tmp_path):
     ]
     for name in names:
         (tmp_path / name).touch()
+    os.mkfifo(tmp_path / "uav-011.mcap")  # whoever opened it to read would wait for ever
+    (tmp_path / "uav-012.mcap").mkdir()
     found = {process: path.name for process, path in run_files(tmp_path).items()}
     assert list(found.items()) == [
         ("tmc", "tmc.mcap.active"),
