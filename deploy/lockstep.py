@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from learner.trainer import Trainer
 
 
+RUN = "lockstep"
+"""What its log calls the run of a mission in one process."""
 Testify = Callable[[int, Any], None]
 """Takes UAV i's overfly.Witness to the moves of a record."""
 
@@ -47,7 +49,7 @@ class LockStep:
     ) -> None:
         config = world.config
         self.world, self.keep, self.trainer, self.testify = world, keep, trainer, testify
-        self.station = Station(world, "lockstep", learning=trainer is not None, policy=policy)
+        self.station = Station(world, RUN, learning=trainer is not None, policy=policy)
         observer = self.station.observer
         table = TrackTable(config.team.size, config.training.ticks)
         planner = PlannerDecider(world, config.team.pilot) if config.team.pilot.startswith(PREFIX) else None
@@ -141,7 +143,7 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
         from learner.trainer import start  # noqa: PLC0415  torch only where something is learned
 
         trainer = start(config, world.grid)
-    journal = Journal(out, world, "lockstep")
+    journal = Journal(out, world, RUN)
     try:
         with _testimonies(world, out) as testify:
             mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, testify)
@@ -163,7 +165,7 @@ def _testimonies(world: World, out: Path) -> Iterator[Testify | None]:
         return
     with ExitStack() as stack:
         names = [uav_name(i) for i in range(config.team.size)]
-        facts = {"run": "lockstep"}
+        facts = {"run": RUN}
         logs = [stack.enter_context(LogWriter(out / f"{n}.mcap", n, config.journal, facts)) for n in names]
 
         def testify(uav: int, message: Any) -> None:

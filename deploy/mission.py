@@ -18,8 +18,9 @@ from actors.tracks import create_table
 from deploy import lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
+from tmc.analysis.setting import config_of
 from tmc.journal import journal_in
-from tmc.kernel.config import Config, ConfigError, build, flat
+from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.policy import check_view, view_shape
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
@@ -86,10 +87,7 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
     journal = journal_in(out)
     if journal is None:
         raise ConfigError(f"{out} holds no journal (tmc.mcap): --resume takes the folder of a run that was begun")
-    try:
-        values = json.loads((out / "config.json").read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{out / 'config.json'} cannot be read ({error}): the run cannot go on without it") from None
+    config = config_of(out, journal)
     with disk.open_held(journal, "rb"):
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
@@ -97,7 +95,23 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
         print(f"overfly: {text}, and `overfly log recover` says what else is in it", file=sys.stderr)
     file = flown_policy(out)
     policy = file.read_bytes() if file.exists() else None
-    return check(build(values), policy), policy
+    if log.metadata().get("run") == lockstep.RUN and policy is None and not who.is_planner(config):
+        raise ConfigError(f"{out} was trained in lock step, which leaves no checkpoint to go on from: run it again")
+    return check(config, policy), policy
+
+
+def keep_settings(out: Path, config: Config, policy: bytes | None) -> Path | None:
+    """Put down what a run flies by, before it begins: `config.json`, and the fixed policy, whose path it returns.
+
+    On the disk at once, since after a power cut there is no journal yet that has a copy.
+    """
+    disk.put(out / "config.json", (json.dumps(flat(config), indent=1) + "\n").encode(), sync=True)
+    if policy is None:
+        return None
+    file = flown_policy(out)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    disk.put(file, policy, sync=True)
+    return file
 
 
 def finished(out: Path) -> bool:
@@ -117,12 +131,7 @@ class Mission:
     ) -> None:
         config = world.config
         self.world, self.config, self.out, self.command = world, config, out, command
-        self.policy: Path | None = None
-        if policy is not None:
-            self.policy = flown_policy(out)
-            self.policy.parent.mkdir(parents=True, exist_ok=True)
-            self.policy.write_bytes(policy)
-        (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
+        self.policy = keep_settings(out, config, policy)
         self.progress = progress or Progress(config, self.world.law.cells.size, bound_of(self.world))
         self._start = time.time()
         self._ended: dict[str, Any] = {}
@@ -135,6 +144,7 @@ class Mission:
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
+                self._ended = {"exit_codes": {lockstep.RUN: process.DONE}}
             else:
                 self._fly()
             self._seal()

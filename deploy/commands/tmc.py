@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -48,18 +47,16 @@ def main(args: argparse.Namespace) -> int:
         config, policy = build(values), pilot.policy
     mission.check(config, policy)
     out = mission.new_folder(args.out, "tmc")
-    (out / "config.json").write_text(json.dumps(flat(config), indent=1) + "\n")
-    path = None
-    if policy is not None:
-        path = out / "policies" / "flown.onnx"
-        path.parent.mkdir()
-        path.write_bytes(policy)
+    path = mission.keep_settings(out, config, policy)
     print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
     return _sealed(serve(config, args.bind, out, policy=path, tracks=""), config, out)
 
 
 def resume(args: argparse.Namespace) -> int:
-    """Serve on where an earlier TMC was stopped or killed; its UAVs and learner find it by themselves."""
+    """Serve on where an earlier TMC was killed, or stopped.
+
+    UAVs and learner of one that was killed find this one by themselves; one that was stopped has sent them home.
+    """
     if args.out or args.fly or settings.chosen(args):
         raise ConfigError("--resume goes on with the mission's own settings: give it nothing but --bind")
     world, policy = mission.interrupted(args.resume)

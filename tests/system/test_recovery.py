@@ -153,7 +153,7 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
         (("run", "--resume", empty), "holds no journal (tmc.mcap): --resume takes the folder of a run that was begun"),
         (("tmc", "--resume", empty), "holds no journal (tmc.mcap)"),
         (("run", "--resume", tmp_path / "gone"), "holds no journal (tmc.mcap)"),
-        (("run", "--resume", strange), "config.json cannot be read"),
+        (("run", "--resume", strange), "has no config.json, and its log holds none either"),
         (
             ("run", "quick", "--resume", strange),
             "with its own settings, as processes: give it nothing but --json, --no-pictures",
@@ -166,6 +166,30 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
         said = capsys.readouterr()
         assert sentence in said.err and len(said.err.splitlines()) == 1 and said.out == ""
     assert list(empty.iterdir()) == []
+
+
+def test_a_training_in_lock_step_is_never_learned_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It leaves no checkpoint: a learner that went on with it would begin with random weights."""
+    out, small = tmp_path / "R", ("--ticks", "40", "--episodes", "2", "--set", "replay.learn_start=30", "--no-pictures")
+    assert main(["run", "quick", "--lockstep", "--set", "dqn.batch=8", *small, "--out", str(out)]) == 0
+    policy = (out / "policies" / "final.onnx").read_bytes()
+    assert "one, in lock step" in capsys.readouterr().out
+    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0  # it is over: summed up again
+    (out / "run.json").unlink()  # as where it was interrupted
+    assert main(["run", "--resume", str(out)]) == 2
+    assert "was trained in lock step, which leaves no checkpoint to go on from" in capsys.readouterr().err
+    assert (out / "policies" / "final.onnx").read_bytes() == policy
+
+
+def test_an_empty_config_keeps_nobody_from_going_on(tmp_path: Path) -> None:
+    """It is what a power cut may leave of a file; the journal has a copy."""
+    out = tmp_path / "R"
+    assert main(["fly", "planner:greedy", "--lockstep", "--ticks", "60", "--no-pictures", "--out", str(out)]) == 0
+    flown = digest(out)
+    (out / "config.json").write_text("")
+    (out / "run.json").unlink()
+    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0
+    assert digest(out) == flown and json.loads((out / "config.json").read_text())["training.ticks"] == 60
 
 
 def test_a_damaged_journal_is_gone_on_with_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

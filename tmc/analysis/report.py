@@ -95,6 +95,8 @@ def _events(f: EpisodeFacts) -> str:
 
 def _processes(s: Summary) -> str:
     codes, restarts = s.health.exit_codes, s.health.restarts
+    if codes == {"lockstep": 0}:
+        return "one, in lock step"
     if not codes:
         return "no exit codes: one process, or still flying, or killed"
     bad = [f"{name} ended with {'no exit code' if code is None else code}" for name, code in codes.items() if code != 0]

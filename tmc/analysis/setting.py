@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,17 +16,24 @@ from tmc.record.frames import DamageError, contents
 
 ATTACHED = frozenset(("config.json", "map.csv"))
 """What the TMC attaches at the start of its log."""
+_NO_CONFIG = (ValueError, AttributeError)
+"""What comes of text that is no config: ConfigError is a ValueError, and so is broken JSON."""
 
 
 def world_of(folder: Path, tmc_log: Path) -> tuple[World, list[str]]:
     """The world, and a note where the map is no longer what was flown over; RecordError without a usable config."""
     attached = attachments(tmc_log)
-    config = _config(folder, attached)
-    road_map, notes = _map(config, attached.get("map.csv"))
+    config, notes = _config(folder, attached.get("config.json"))
+    road_map, changed = _map(config, attached.get("map.csv"))
     try:
-        return World(config, road_map), notes
+        return World(config, road_map), notes + changed
     except ConfigError as error:
         raise RecordError(f"the config of {folder} does not fit its map: {error}") from None
+
+
+def config_of(folder: Path, tmc_log: Path) -> Config:
+    """The settings of a run: of its `config.json`, or of the log where that is gone or broken. RecordError."""
+    return _config(folder, attachments(tmc_log).get("config.json"))[0]
 
 
 def attachments(tmc_log: Path) -> dict[str, str]:
@@ -47,16 +52,23 @@ def attachments(tmc_log: Path) -> dict[str, str]:
     return found
 
 
-def _config(folder: Path, attached: Mapping[str, str]) -> Config:
+def _config(folder: Path, attached: str | None) -> tuple[Config, list[str]]:
+    """The config, and a note where the file of the folder is no config, so that the log's copy is used."""
     path = folder / "config.json"
     try:
-        text = path.read_text("utf-8") if path.is_file() else attached["config.json"]
-        values: Any = json.loads(text)
-        return build(values)
-    except KeyError:
-        raise RecordError(f"{folder} has no config.json, and its log none either: give the folder of a run") from None
-    except (OSError, ValueError, AttributeError) as error:  # ConfigError is a ValueError, and so is broken JSON
-        raise RecordError(f"{path} is not the config of a run ({error}): mend it, or use another copy") from None
+        return _parsed(path.read_text("utf-8")), []
+    except FileNotFoundError:
+        wrong, notes = f"{folder} has no config.json", list[str]()
+    except (OSError, *_NO_CONFIG) as error:
+        wrong, notes = f"{path} is not the config of a run ({error})", [f"{path.name}: no config, the log's is used"]
+    try:
+        return _parsed(attached or ""), notes
+    except _NO_CONFIG:
+        raise RecordError(f"{wrong}, and its log holds none either: give the folder of a run") from None
+
+
+def _parsed(text: str) -> Config:
+    return build(json.loads(text))
 
 
 def _map(config: Config, csv: str | None) -> tuple[RoadMap, list[str]]:

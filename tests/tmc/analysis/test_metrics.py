@@ -229,7 +229,13 @@ def test_without_config_json_the_log_has_it(fly, tmp_path):
     folder = copy_of(fly(), tmp_path)
     (folder / "config.json").unlink()
     assert summary(folder).episodes == summary(fly()).episodes
-    (folder / "config.json").write_text('{"scenario": 7}')
+    for broken in ('{"scenario": 7}', "", "[]"):  # an empty one is what a power cut may leave
+        (folder / "config.json").write_text(broken)
+        assert "config.json: no config, the log's is used" in summary(folder).health.notes
+        assert summary(folder).episodes == summary(fly()).episodes
+    data = bytearray((folder / "tmc.mcap").read_bytes())
+    data[data.index(b'"world.map"')] = ord("}")
+    (folder / "tmc.mcap").write_bytes(data)
     with pytest.raises(RecordError, match="is not the config of a run"):
         read(folder)
 
