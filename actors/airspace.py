@@ -28,6 +28,9 @@ class Tracks(Protocol):
     def publish(self, tick: int, cell: int) -> None:
         """This process's UAV stands on `cell` at `tick`."""
 
+    def lose(self, uav: int) -> None:
+        """A UAV is lost for the rest of the episode: it need not be told any more."""
+
 
 class Waiting(Exception):  # noqa: N818  it is no error: it says what must be known before the UAV can go on
     """The cell of UAV `peer` at `tick` is needed."""
@@ -56,6 +59,7 @@ class Airspace:
     def lose(self, uav: int) -> None:
         """Never wait for this UAV again: where it is not known, it is not."""
         self._lost.add(uav)
+        self.tracks.lose(uav)
 
     def sense(self, t: int, cell: int) -> list[int]:
         """Cells of the peers in N_i(t), in order of their ids; raises Waiting when one may be near and is unknown."""

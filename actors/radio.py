@@ -34,7 +34,7 @@ class RadioTracks:
     def begin(self, episode: int, starts: list[int]) -> None:
         self._episode = episode
         self._known = [[cell] for cell in starts]
-        self._told = [0] * self.team
+        self._told, self._lost = [0] * self.team, set[int]()
         early, self._early = self._early, []
         for beacon in early:
             self.hear(beacon)
@@ -53,10 +53,13 @@ class RadioTracks:
             own.append(cell)
         by_start: dict[int, list[int]] = {}  # those who were told up to the same tick get the same beacon
         for j in range(self.team):
-            if j != self.uav and self._could_matter(j, tick):
+            if j != self.uav and j not in self._lost and self._could_matter(j, tick):
                 by_start.setdefault(self._told[j] + 1, []).append(j)
         for start, to in by_start.items():
             self._tell(start, to)
+
+    def lose(self, uav: int) -> None:
+        self._lost.add(uav)
 
     def _could_matter(self, j: int, t: int) -> bool:
         s, (s_j, c_j) = self._told[j], self.newest(j)

@@ -31,7 +31,7 @@ from tmc.wire import messages as m
 from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
 
-SILENCE = (0.25, 1.0)
+SILENCE = (0.25, 0.5)
 """Seconds after which a message that was not answered goes out again: at first, and at most; doubles in between."""
 ASK_EVERY = 0.2
 """Seconds after which a UAV that waits for a peer's beacon asks for it, and asks again."""
@@ -222,7 +222,7 @@ class Service:
 
     def _on_error(self, error: m.Error) -> None:
         self._note("ERROR", f"the TMC says: {error.text}")
-        if error.code == "fenced":
+        if error.code == "fenced" and error.life == self.life:
             raise Left(process.FENCED, error.text)
         if error.code == "state" and time.monotonic() - self._asked > SILENCE[0]:
             self._asked = time.monotonic()  # a TMC that was started again knows less than it did

@@ -33,7 +33,7 @@ class StallingTracks:
     def __init__(self, tracks: Tracks, config: Config, uav: int, sleep: Callable[[float], None] = time.sleep) -> None:
         self._tracks, self._config, self._uav, self._sleep = tracks, config, uav, sleep
         self._episode = 0
-        self.newest, self.at = tracks.newest, tracks.at
+        self.newest, self.at, self.lose = tracks.newest, tracks.at, tracks.lose
 
     def begin(self, episode: int, starts: list[int]) -> None:
         self._episode = episode

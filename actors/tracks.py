@@ -79,6 +79,9 @@ class TableTracks:
             words[row + 1] = 0
             futex.wake(self._address + 8 * row)
 
+    def lose(self, uav: int) -> None:
+        """Nobody is told anything here."""
+
     def wait(self, uav: int, tick: int, seconds: float) -> None:
         """Sleep until another UAV has published `tick`, at most so many seconds; may return early, so look again.
 

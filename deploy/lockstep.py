@@ -14,6 +14,7 @@ from actors.tracks import TableTracks, TrackTable
 from actors.witness import Witness
 from deploy.progress import Progress
 from tmc.journal import Journal
+from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
@@ -147,13 +148,26 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
     try:
         with _testimonies(world, out) as testify:
             mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, testify)
-            mission.run(progress.show)
+            _run(mission, progress.show)
         if trainer is not None:
             from learner.service import write_policy  # noqa: PLC0415
 
             write_policy(out / "policies" / "final.onnx", trainer.policy()[1])
     finally:
         journal.writer.close()
+
+
+def _run(mission: LockStep, show: Callable[[m.Status], None]) -> None:
+    """Fly and learn; ConfigError where the training diverges."""
+    if mission.trainer is None:
+        mission.run(show)
+        return
+    from learner.intake import TrainingError  # noqa: PLC0415
+
+    try:
+        mission.run(show)
+    except TrainingError as error:
+        raise ConfigError(str(error)) from None
 
 
 @contextmanager

@@ -10,22 +10,26 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads must not spin where UAVs want the core
 
 from learner.checkpoint import CheckpointError
-from learner.service import Service
+from learner.intake import TrainingError
+from learner.service import ReplacedError, Service
 from tmc.kernel.config import ConfigError
 from tmc.kernel.roadmap import MapError
 from tmc.record.errors import RecordError
 from tmc.wire import process
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError)
+MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, TrainingError)
 
 
 def learn(endpoint: str, out: Path) -> int:
-    """Learn until the TMC ends the mission; returns the exit code."""
+    """Learn until the TMC ends the mission; returns the exit code. Raises MISTAKES."""
     stop = process.Stop()
     service = Service(endpoint, out)
     try:
         return process.DONE if service.learn(stop) else stop.code
+    except ReplacedError as error:
+        print(f"overfly: {error}", file=sys.stderr)
+        return process.FENCED
     finally:
         service.close()
 

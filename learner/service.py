@@ -33,6 +33,10 @@ METRICS_EVERY = 0.2
 """Seconds between two metrics messages in the log."""
 
 
+class ReplacedError(Exception):
+    """A newer process is the learner of the mission now."""
+
+
 class Service:
     """The learner of the mission that the TMC at `endpoint` runs; logs, checkpoints and policies go to `out`."""
 
@@ -42,7 +46,9 @@ class Service:
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, sockets.feed_endpoint(endpoint), "learner")
         self.log: LogWriter | None = None
-        self._request = 0
+        self._request, self._flying = 0, set[int]()
+        """The number of the last request for a minibatch, and the requests in flight."""
+        self._hailed = False
         self._idle = 0.0
         self._metrics_due = 0.0
         self._loss = 0.0
@@ -54,14 +60,13 @@ class Service:
         if skipped and saved is None:
             raise CheckpointError(f"no checkpoint in {folder} is sound: remove them all to begin with new weights")
         welcome = self._join(saved, stop)
-        if welcome is None:
-            return False
+        if not isinstance(welcome, m.Welcome):
+            return welcome is not None
         self._prepare(welcome, saved)
         for text in skipped:
-            self._warn(text)
+            self._say("warning", text)
         self._push()
-        for _ in range(WINDOW):
-            self._ask()
+        self._ask()
         over = False
         while not over and not stop():
             for message in self._listen():
@@ -69,18 +74,16 @@ class Service:
         self._finish()
         return over
 
-    def _join(self, saved: Saved | None, stop: Callable[[], bool]) -> m.Welcome | None:
-        """Say hello until the TMC answers."""
+    def _join(self, saved: Saved | None, stop: Callable[[], bool]) -> m.Welcome | m.End | None:
+        """Say hello until the TMC answers; None when stopped before."""
         while not stop():
             sockets.send(self.sock, m.Hello("learner", -1, self.life, saved.meta.updates if saved else 0))
             if self.sock.poll(1000):
                 message = self._receive()
-                if isinstance(message, m.Welcome):
+                if isinstance(message, m.Welcome | m.End):
                     return message
                 if isinstance(message, m.Error):
                     raise EndpointError(f"the TMC refused: {message.text}")
-                if isinstance(message, m.End):
-                    return None
         return None
 
     def _prepare(self, welcome: m.Welcome, saved: Saved | None) -> None:
@@ -114,6 +117,7 @@ class Service:
         since = time.monotonic()
         if not self.sock.poll(int(SILENCE * 1000)):
             sockets.send(self.sock, m.Hello("learner", -1, self.life, self.trainer.updates))
+            self._hailed = True
         self._idle += time.monotonic() - since
         message = self._receive()
         return [] if message is None else [message]
@@ -122,33 +126,41 @@ class Service:
         try:
             return sockets.receive_message(self.sock)
         except CodecError as error:
-            self._warn(f"dropped a frame: {error}")
+            self._say("warning", f"dropped a frame: {error}")
             return None
 
-    def _warn(self, text: str) -> None:
+    def _say(self, level: str, text: str) -> None:
         if self.log is not None:
-            self.log.log("warning", text)
+            self.log.log(level, text)
 
     def _obey(self, message: m.Message) -> bool:
-        """Act on a message of the TMC; True when the mission is over."""
+        """Act on a message of the TMC; True when the mission is over. Raises ReplacedError."""
         if isinstance(message, m.Minibatch):
             self._update(message)
+            self._flying.discard(message.request)
             self._ask()  # now: the TMC is at work for it while the other threads have nothing to do
         elif isinstance(message, m.Welcome) and message.run != self._run:
             raise EndpointError("another mission runs here now: start a learner for it with another --out")
         elif isinstance(message, m.Welcome):  # a TMC that has lost our requests, and perhaps its numbers
             self.trainer.forget()
             self.trainer.version = max(self.trainer.version, message.policy)
-            self._push()
-            for _ in range(WINDOW):
+            if self._hailed:  # one answer is enough for all hellos that a TMC found when it was back
+                self._hailed = False
+                self._flying.clear()
+                self._push()
                 self._ask()
-        elif isinstance(message, m.Error) and self.log is not None:
-            self.log.log("error", f"the TMC says: {message.text}")
+        elif isinstance(message, m.Error):
+            self._say("error", f"the TMC says: {message.text}")
+            if message.code == "fenced" and message.life == self.life:
+                raise ReplacedError(message.text)
         return isinstance(message, m.End)
 
     def _ask(self) -> None:
-        self._request += 1
-        sockets.send(self.sock, m.SampleRequest(self._request, *self.trainer.judged()))
+        """Ask for minibatches until there are WINDOW requests in flight."""
+        while len(self._flying) < WINDOW:
+            self._request += 1
+            self._flying.add(self._request)
+            sockets.send(self.sock, m.SampleRequest(self._request, *self.trainer.judged(), self.life))
 
     def _update(self, minibatch: m.Minibatch) -> None:
         metrics = self.trainer.update(self.intake.read(minibatch))
@@ -161,7 +173,8 @@ class Service:
 
     def _push(self) -> bytes:
         version, model = self.trainer.policy()
-        sockets.send(self.sock, m.PolicyPush(version, self.trainer.updates, self._loss, model, time.time_ns()))
+        push = m.PolicyPush(version, self.trainer.updates, self._loss, model, time.time_ns(), self.life)
+        sockets.send(self.sock, push)
         return model
 
     def _report(self, metrics: UpdateMetrics, minibatch: m.Minibatch) -> None:

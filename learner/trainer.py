@@ -6,7 +6,6 @@ The only randomness is that of the initial weights; the same minibatches in the 
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +26,8 @@ from tmc.kernel.observation import Floats, Ints
 from tmc.kernel.policy import card_for, view_shape
 
 NOTHING = np.zeros(0, np.int64), np.zeros(0, np.float32)
+HUGE = 1e30
+"""No loss and no value of Q is that large, unless the training diverges."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class Trainer:
             p.grad = g
         means = (loss, q.mean(), y.mean(), (q - y).abs().mean(), torch.linalg.vector_norm(flat(gradient)))
         values = torch.stack(means).tolist()
-        if not all(map(math.isfinite, values)):
+        if not all(abs(value) < HUGE for value in values):  # which is not so for NaN either
             raise TrainingError(
                 f"update {self.updates + 1} diverged (loss {values[0]:g}): lower dqn.learning_rate or dqn.reward_scale"
             )

@@ -10,15 +10,19 @@ from tmc.wire.messages import Hello, Minibatch, SampleRequest
 
 WINDOW = 8
 """Most requests that may be in flight."""
+REPLACED = ("fenced", "a newer process is the learner: leave")
 
 
 class Feed:
-    """Requests in the order of their arrival. `life`: the learner's process, -1 before there is one."""
+    """Requests in the order of their arrival.
+
+    `life`: the learner's process, -1 before there is one; `past`: those whose place it took, which may still speak.
+    """
 
     def __init__(self, replay: Replay, limiter: Limiter, batch: int) -> None:
         self.replay, self.limiter, self.batch = replay, limiter, batch
         self._T = replay.world.config.training.ticks
-        self.life = -1
+        self.life, self.past = -1, set[int]()
         self.told_the_end = self.recovered = False
         self._requests: list[int] = []
 
@@ -27,6 +31,7 @@ class Feed:
         self._requests.clear()  # it asks again once it is welcome
         self.told_the_end = False  # or it would not have said hello
         if hello.life != self.life:
+            self.past |= {self.life} - {-1}
             self.life = hello.life
             # A TMC that was started again knows how far the learner was a moment ago; the learner knows how far it is.
             self.limiter.updates = hello.updates if self.recovered else min(self.limiter.updates, hello.updates)

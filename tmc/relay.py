@@ -66,6 +66,15 @@ def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
         station.reject(sender, "state", f"{sender} has flown on from what is not known here: say hello")
 
 
+def policy_request(station: Station, sender: str, request: m.PolicyRequest, _now: float) -> None:
+    """A UAV was told to fly another policy than it has."""
+    found = station.policies.find(request.version)
+    if found is None:
+        station.reject(sender, "state", f"there is no policy {request.version}")
+    else:
+        station.send(sender, m.Policy(*found))
+
+
 def status_request(station: Station, sender: str, _request: m.StatusRequest, _now: float) -> None:
     """Somebody wants to know how far the mission is."""
     station.send(sender, status(station))

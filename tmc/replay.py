@@ -2,7 +2,7 @@
 
 A row is one tick of the whole team: where each UAV stood, the action and reward that brought it there, and which map
 frame it last got from the TMC. What UAV i believed at tick t follows: the frame, then the local updates of the ticks
-since (Sec. II-D). So a transition costs about 11 bytes and its share of a frame, not two images.
+since (Sec. II-D). So a transition costs some 24 bytes and its share of a frame, not two images.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ class Service:
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
-        if isinstance(message, PolicyPush) and sender == LEARNER:
+        if isinstance(message, PolicyPush) and sender == LEARNER and message.life not in self.station.feed.past:
             self._waiting = message  # in the place of one that may wait
             self._take_waiting()
         else:

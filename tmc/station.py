@@ -12,7 +12,7 @@ from typing import Any
 
 from tmc import entries, relay, roster
 from tmc.early import Early
-from tmc.feed import Feed
+from tmc.feed import REPLACED, Feed
 from tmc.flight import Exchange, Flight, Truth
 from tmc.kernel.config import flat
 from tmc.kernel.observation import Observer
@@ -64,13 +64,15 @@ class Station:
         return "learning" if self.limiter.owed and len(self.replay) else "done"
 
     def waiting_for(self) -> list[str]:
-        """Who keeps the mission from going on: processes not here yet, or UAVs whose record is due next."""
+        """Who keeps the mission from going on: who is not here yet, UAVs whose record is due next, or the learner."""
         if self.flight is None:
             if self.phase != "gathering":
                 return []
             missing = [uav_name(i) for i in roster.away(self.roster)]
             return missing + ([LEARNER] if self.learning and not self.policies.newest else [])
         flight, t = self.flight, self.flight.next_exchange
+        if not self.limiter.may_insert and len(self.replay):
+            return [LEARNER]  # it keeps the UAVs' answers from them
         return [uav_name(i) for i in flight.due(t) if flight.reported[i] < t]
 
     # Messages in.
@@ -87,14 +89,16 @@ class Station:
             self.reject(sender, "state", f"{type(message).__name__} is not a message for the TMC")
         elif isinstance(message, m.SampleRequest | m.PolicyPush) and (sender != LEARNER or not self.learning):
             self.reject(sender, "refused", f"only the learner may send a {type(message).__name__}")
+        elif isinstance(message, m.SampleRequest | m.PolicyPush) and message.life in self.feed.past:
+            self.reject(sender, *REPLACED, message.life)
         else:
             handler(self, sender, message, now)
 
-    def reject(self, sender: str, code: str, text: str) -> None:
+    def reject(self, sender: str, code: str, text: str, life: int = 0) -> None:
         """Count and note a frame that changes nothing, and tell its sender what was wrong."""
         self.rejected += 1
         self.out.notes.append(("WARNING", f"rejected a frame from {sender}: {text}"))
-        self.send(sender, m.Error(code, text[:1024]))
+        self.send(sender, m.Error(code, text[:1024], life))
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))
@@ -103,14 +107,16 @@ class Station:
         if hello.role == "learner":
             if not self.learning or sender != LEARNER:
                 self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
-                return
-            self.feed.welcome(hello)
-            self.send(sender, welcome)
-            self._finish_if_done()
+            elif hello.life in self.feed.past:
+                self.reject(sender, *REPLACED, hello.life)
+            else:
+                self.feed.welcome(hello)
+                self.send(sender, welcome)
+                self._finish_if_done()
             return
         problem = roster.hello_problem(self.roster, sender, hello)
         if problem is not None:
-            self.reject(sender, *problem)
+            self.reject(sender, *problem, hello.life)
             return
         if self.roster[hello.uav].live(hello.life, now):
             self.early.drop(hello.uav)
@@ -127,7 +133,7 @@ class Station:
     def _record(self, sender: str, record: m.Record, now: float) -> None:
         problem = roster.record_problem(self.roster, sender, record)
         if problem is not None:
-            self.reject(sender, *problem)
+            self.reject(sender, *problem, record.life)
             return
         member = self.roster[record.uav]
         member.heard, member.named = now, False
@@ -215,7 +221,8 @@ class Station:
 
     def _resume(self, i: int) -> None:
         flight, member = self.flight, self.roster[i]
-        assert flight is not None
+        if flight is None or self._held:
+            return  # the limiter holds the team back: it is told when the others are, or says hello again
         relay.tracks(self, i, flight.lost)
         self.send(uav_name(i), flight.begin(i, member.policy, member.sequence))
         if member.answer is not None and member.answer.tick == flight.reported[i]:
@@ -300,13 +307,6 @@ class Station:
         self.loss = loss
         self.out.entries.append(entries.policy(version, updates, loss, model, sent, last=self._ended))
 
-    def _policy_request(self, sender: str, request: m.PolicyRequest, _now: float) -> None:
-        found = self.policies.find(request.version)
-        if found is None:
-            self.reject(sender, "state", f"there is no policy {request.version}")
-        else:
-            self.send(sender, m.Policy(*found))
-
     # Silence.
 
     def tick(self, now: float) -> None:
@@ -342,7 +342,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {
     m.Record: Station._record,
     m.SampleRequest: Station._sample_request,
     m.PolicyPush: Station._policy_push,
-    m.PolicyRequest: Station._policy_request,
+    m.PolicyRequest: relay.policy_request,
     m.Alive: relay.alive,
     m.Beacon: relay.beacon,
     m.StatusRequest: relay.status_request,

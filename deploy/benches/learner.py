@@ -147,7 +147,8 @@ def _wait(
 ) -> tuple[float, messages.Status]:
     """(seconds of the clock, status) when there have been `updates`, and the clock is past `until`."""
     while True:
-        supervisor.watch()
+        if supervisor.watch():
+            raise ConfigError("the mission was over before it was measured: give it more --episodes or --ticks")
         status, now = observer.ask(), time.monotonic()
         if status is not None and status.updates >= updates and now >= until:
             return now, status

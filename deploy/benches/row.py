@@ -6,6 +6,7 @@ import os
 import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 
@@ -34,11 +35,21 @@ def machine() -> dict[str, Any]:
     """Processor, cores, load and versions: what a figure means nothing without."""
     return {
         "platform": platform.platform(),
+        "processor": _processor(),
         "cores": core_count(),
         "load": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
-        **{name: _version(name) for name in ("overfly", "numpy", "pyzmq", "onnxruntime")},
+        **{name: _version(name) for name in ("overfly", "numpy", "torch", "pyzmq", "onnxruntime")},
     }
+
+
+def _processor() -> str:
+    """The model's name, where Linux tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def _version(name: str) -> str | None:

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass
 
 from deploy.benches import cores
 from deploy.benches.row import machine, text
+from deploy.supervisor import MissionFailed
+from tmc.wire.process import FAILED
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,12 @@ def main(args: argparse.Namespace) -> int:
     """Measure, then print the table, or a line of JSON a figure with the machine and the versions."""
     facts = machine()
     before = cores.worth()
-    rows = importlib.import_module(next(b.module for b in BENCHES if b.name == args.bench)).measure(args)
+    bench = importlib.import_module(next(b.module for b in BENCHES if b.name == args.bench))
+    try:
+        rows = bench.measure(args)
+    except MissionFailed as failed:
+        print(f"overfly: {failed}", file=sys.stderr)
+        return FAILED
     facts["cores_worth"] = [before, cores.worth()]
     if args.json:
         for row in rows:

@@ -8,7 +8,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -100,7 +100,7 @@ def team_sizes(listed: str | None) -> list[int | None]:
 def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | None]]:
     """(WHO, config, policy) of every mission, checked before the first one flies."""
     pilots = [who.resolve(name) for name in args.who]
-    shared = shared_world(pilots)
+    shared = shared_world(pilots, {*settings.chosen(args), *(["team.size"] if args.actors else [])})
     for pilot in pilots:
         for n in team_sizes(args.actors):
             values = {**pilot.values, **shared, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
@@ -112,12 +112,13 @@ def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | No
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy
 
 
-def shared_world(pilots: list[who.Who]) -> dict[str, Any]:
-    """The world of the run folders among WHO, for everybody in the table; ConfigError when they do not agree."""
+def shared_world(pilots: list[who.Who], chosen: Collection[str] = ()) -> dict[str, Any]:
+    """The world of the run folders among WHO, for everybody in the table; ConfigError when they do not agree on what
+    is not `chosen` for all of them."""
     worlds = [{k: v for k, v in p.values.items() if k in WORLD or k.startswith("world.")} for p in pilots]
     worlds = [world for world in worlds if world]
     for world in worlds[1:]:
-        differ = [key for key in world if world[key] != worlds[0].get(key)]
+        differ = [key for key in world if key not in chosen and world[key] != worlds[0].get(key)]
         if differ:
             raise ConfigError(f"the runs differ in {', '.join(differ)}: set it for all of them with --set, or apart")
     return worlds[0] if worlds else {}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from tmc.wire import process
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
@@ -15,6 +17,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Learn until the TMC ends the mission."""
-    from learner.__main__ import learn  # noqa: PLC0415  torch is imported only when a learner is meant
+    from learner.__main__ import MISTAKES, learn  # noqa: PLC0415  torch is imported only when a learner is meant
 
-    return learn(args.connect, args.out)
+    return process.run(lambda: learn(args.connect, args.out), MISTAKES)

@@ -285,3 +285,17 @@ def test_a_beacon_of_the_next_episode_is_kept_until_it_begins() -> None:
     assert radio.newest(1) == (1, 5)
     radio.begin(2, [0, 7])
     assert radio.newest(1) == (0, 7)
+
+
+def test_who_is_lost_is_told_no_more() -> None:
+    """Its track stands still, so that by the rule each of this UAV's positions could matter to it."""
+    said: list[Beacon] = []
+    airspace = Airspace(0, 3, Grid(3, 3), 1.5, RadioTracks(0, 3, Grid(3, 3), 1.5, said.append))
+    airspace.begin(1, [0, 2, 8])
+    airspace.lose(2)
+    for tick, cell in enumerate([1, 4, 1, 0], 1):
+        airspace.tracks.publish(tick, cell)
+    assert said and all(beacon.to.tolist() == [1] for beacon in said)
+    airspace.begin(2, [0, 2, 8])
+    airspace.tracks.publish(1, 4)
+    assert 2 in said[-1].to.tolist() + said[-2].to.tolist()

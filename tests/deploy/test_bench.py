@@ -137,6 +137,12 @@ def test_a_number_that_makes_no_sense_is_one_sentence(mistake: list[str], capsys
     assert mistake[1] in capsys.readouterr().err
 
 
+def test_a_mission_that_is_over_before_it_is_measured_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--ticks", "40", "--episodes", "1", "--set", "replay.learn_start=20", "--set", "dqn.batch=8"]
+    assert cli.main(["bench", "learner", "--repeats", "1", "--threads", "1", "--seconds", "30", *small]) == 2
+    assert "the mission was over before it was measured: give it more --episodes" in capsys.readouterr().err
+
+
 def test_memory_is_what_the_system_says() -> None:
     memory = rollout.weigh_all({"uav-000": os.getpid()})
     assert memory is not None and 1 < memory.private < 4096 and memory.total > 0

@@ -6,12 +6,15 @@ import json
 from pathlib import Path
 
 import pytest
+import zmq
 
 from learner.checkpoint import CheckpointError
-from learner.service import Service
+from learner.service import WINDOW, ReplacedError, Service
 from tmc.kernel.config import build, flat
 from tmc.kernel.world import World
 from tmc.wire import messages as m
+from tmc.wire import sockets
+from tmc.wire.codec import decode
 from tmc.wire.sockets import EndpointError
 
 
@@ -51,5 +54,46 @@ def test_damaged_checkpoints_are_not_passed_over_for_new_weights(tmp_path: Path)
     try:
         with pytest.raises(CheckpointError, match=r"no checkpoint in .* is sound: remove them all"):
             service.learn(lambda: False)
+    finally:
+        service.close()
+
+
+def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tmp_path: Path) -> None:
+    """It finds several hellos when it is back, and welcomes each."""
+    tmc = sockets.router(context := zmq.Context(), f"ipc://{tmp_path}/sync.feed")
+    service = Service(f"ipc://{tmp_path}/sync", tmp_path / "R")
+    config = build({"network.channels": (2, 2), "network.dense": 2})
+    welcome = m.Welcome(json.dumps(flat(config)), World(config).map.fingerprint, "run", "", 0, 0)
+
+    def heard() -> list[str]:
+        said = []
+        while tmc.poll(200):
+            frames = sockets.receive(tmc)
+            assert frames is not None
+            said.append(type(decode(frames[1:])).__name__)
+        return said
+
+    try:
+        service._prepare(welcome, None)
+        service._push()
+        service._ask()
+        assert heard() == ["PolicyPush", *["SampleRequest"] * WINDOW]
+        service._hailed = True  # after a second of silence, and another one
+        for _ in range(3):
+            service._obey(welcome)
+        assert heard() == ["PolicyPush", *["SampleRequest"] * WINDOW]
+        assert len(service._flying) == WINDOW
+    finally:
+        service.close()
+        tmc.close()
+        context.destroy(0)
+
+
+def test_a_learner_leaves_when_a_newer_one_has_its_place(tmp_path: Path) -> None:
+    service = Service(f"ipc://{tmp_path}/sync", tmp_path / "R")
+    try:
+        assert not service._obey(m.Error("fenced", "a newer process is the learner: leave", service.life + 1))
+        with pytest.raises(ReplacedError, match="a newer process is the learner"):
+            service._obey(m.Error("fenced", "a newer process is the learner: leave", service.life))
     finally:
         service.close()

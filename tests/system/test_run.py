@@ -55,6 +55,26 @@ def test_the_log_knows_when_who_sent_something_made_it(trained) -> None:
     assert set(under_way["overfly.TeamMetrics"]) == set(under_way["overfly.Sync"]) == {0}
 
 
+@pytest.mark.parametrize(("how", "code"), [((), 1), (("--lockstep",), 2)])
+def test_a_training_that_diverges_says_so_once(here, tmp_path: Path, how: tuple[str, ...], code: int) -> None:
+    wild = ("dqn.learning_rate=10", "dqn.target_updates=1", "dqn.gamma=1", "dqn.loss=mse", "dqn.reward_scale=1000")
+    small = ("--ticks", 200, "--set", "replay.learn_start=30", "--set", "dqn.batch=8", "--no-pictures")
+    done = here("run", "quick", *how, *small, *(x for s in wild for x in ("--set", s)), "--out", tmp_path / "R")
+    assert done.returncode == code, done.stderr
+    assert done.stderr.count("diverged") == 1 and "lower dqn.learning_rate or dqn.reward_scale" in done.stderr
+    assert "Traceback" not in done.stderr and "started again" not in done.stderr
+
+
+def test_the_mend_that_evaluate_names_is_one(here, tmp_path: Path) -> None:
+    for period in (5, 10):
+        fly = (*GREEDY, "--lockstep", "--actors", 2, "--ticks", 20, "--tu", period, "--out", tmp_path / str(period))
+        assert here(*fly).returncode == 0
+    both = ("evaluate", tmp_path / "5", tmp_path / "10", "--seeds", 1)
+    refused = here(*both)
+    assert refused.returncode == 2 and "the runs differ in comms.period: set it for all of them" in refused.stderr
+    assert here(*both, "--set", "comms.period=10").returncode == 0
+
+
 def test_a_run_folder_that_exists_is_refused(here, tmp_path: Path) -> None:
     out = tmp_path / "R"
     out.mkdir()

@@ -478,8 +478,9 @@ def test_minibatches_come_as_they_are_owed(learning: Learning) -> None:
 def test_the_limiter_holds_answers_back_and_releases_them(learning: Learning) -> None:
     learning.ship(0, 0)
     learning.ship(1, 4)
-    assert learning.ship(5, 8) == []  # 4 owed, 2 allowed: the UAVs wait for the learner
     assert learning.station.waiting_for() == ["uav-000", "uav-001"]
+    assert learning.ship(5, 8) == []  # 4 owed, 2 allowed: the UAVs wait for the learner
+    assert learning.station.waiting_for() == ["learner"]
     assert kinds(learning.ask(1)) == [("learner", "Minibatch")]
     sends = learning.ask(2)
     assert kinds(sends) == [("learner", "Minibatch"), ("uav-000", "Map"), ("uav-001", "Map")]
@@ -494,6 +495,43 @@ def test_a_repeat_of_a_held_answer_does_not_get_around_the_limiter(learning: Lea
     assert learning.ship(5, 8) == []
     learning.station.handle("uav-000", next_record(learning.station, 0, 5, 8, 2), 1.0)
     assert sent(learning.station) == []
+
+
+def test_the_next_episode_does_not_get_around_the_limiter(learning: Learning) -> None:
+    """Its begin is held as the last maps are, from who says its last record again and from who is there anew."""
+    learning.ship(0, 0)
+    first, T = 1, learning.station.config.training.ticks
+    while first <= T:
+        sends = learning.ship(first, min(first + 3, T))
+        while not sends and learning.station.limiter.owed > 2 and first + 3 < T:
+            sends = learning.ask(100)
+        first += 4
+    flight = learning.station.flight
+    assert flight is not None and flight.episode == 2 and learning.station.waiting_for() == ["learner"]
+    last = dataclasses.replace(next_record(learning.station, 0, first - 4, T, learning.sequence - 1), episode=1)
+    learning.station.handle("uav-000", last, 1.0)
+    assert sent(learning.station) == []
+    learning.station.handle("uav-001", m.Hello("uav", 1, 99), 1.0)
+    assert kinds(sent(learning.station)) == [("uav-001", "Welcome")]
+    sends = [send for n in range(learning.station.limiter.owed) for send in learning.ask(n)]
+    assert {(to, x.episode) for to, x in sends if isinstance(x, m.Begin)} == {("uav-000", 2), ("uav-001", 2)}
+
+
+def test_there_is_one_learner_and_who_it_replaced_is_told_so(learning: Learning) -> None:
+    station = learning.station
+    station.handle(LEARNER, m.Hello("learner", -1, 6), 1.0)
+    assert kinds(sent(station)) == [("learner", "Welcome")]
+    for late in (
+        m.Hello("learner", -1, 5, 900),
+        m.PolicyPush(7, 9, 0.0, b"late", life=5),
+        m.SampleRequest(3, life=5),
+    ):
+        station.handle(LEARNER, late, 1.0)
+        ((to, error),) = sent(station)
+        assert to == LEARNER and isinstance(error, m.Error) and (error.code, error.life) == ("fenced", 5)
+    assert station.policies.newest == 1
+    station.handle(LEARNER, m.PolicyPush(2, 0, 0.0, b"mine", life=6), 1.0)
+    assert kinds(sent(station)) == [("learner", "Ack")] and station.policies.newest == 2
 
 
 def test_at_most_eight_requests_are_in_flight(learning: Learning) -> None:

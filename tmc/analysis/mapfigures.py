@@ -48,10 +48,11 @@ def map_picture(road_map: RoadMap, path: Path, starts: Iterable[int] = ()) -> Pa
 def paths_picture(world: World, episode: Episode, path: Path) -> Path:
     """The paths of the last ticks over the map at the end of the episode, newest strongest."""
     made, axes = _axes(world.map)
-    end = int(np.flatnonzero((episode.cells != UNKNOWN).all(axis=1))[-1])
+    end = int(np.flatnonzero((episode.cells != UNKNOWN).any(axis=1))[-1])
     handles = _ground(made, axes, world, episode, end)
     flown = episode.cells[max(0, end - TAIL) : end + 1]
-    team = [_path(axes, world.map, flown[:, i], i, flown.shape[1]) for i in range(flown.shape[1])]
+    there = np.flatnonzero((flown != UNKNOWN).any(axis=0))  # others were lost before, or never came
+    team = [_path(axes, world.map, flown[flown[:, i] != UNKNOWN, i], i, flown.shape[1]) for i in there.tolist()]
     handles += team if len(team) <= NAMED else []
     handles += [_marker("o", "white", f"at tick {end - len(flown) + 1:,}", edge=style.GREY, size=6),
                 _marker("o", style.GREY, f"at tick {end:,}")]  # fmt: skip

@@ -72,7 +72,7 @@ def _bound(alpha: bytes, uavs: int, ticks: int) -> float:
 
 def episode_facts(world: World, episode: Episode) -> EpisodeFacts:
     """The numbers of one episode, of the ticks that the log holds."""
-    mean = float(np.nanmean(episode.uncertainty[1:]))
+    mean = _of_known(episode.uncertainty[1:])
     bound, (appeared, cleared, wait) = bound_of(world, episode.ticks), event_facts(world, episode)
     flown, blocks = episode.cells[1:][episode.cells[1:] != UNKNOWN], episode.blocks
     visited = np.unique(episode.cells[episode.cells != UNKNOWN])
@@ -83,12 +83,12 @@ def episode_facts(world: World, episode: Episode) -> EpisodeFacts:
         uncertainty=mean,
         per_cell=mean / world.law.cells.size,
         times_bound=None if bound is None else mean / bound,
-        reward=float(np.nanmean(episode.reward[1:])),
+        reward=_of_known(episode.reward[1:]),
         moves=sum(blocks.values()),
         blocked_grid=blocks.get(Block.GRID, 0),
         blocked_obstacle=blocks.get(Block.OBSTACLE, 0),
         blocked_uav=blocks.get(Block.UAV, 0),
-        on_road=float(world.map.road[flown].mean()),
+        on_road=_of_known(world.map.road[flown]),
         coverage=float(world.map.road[visited].sum() / world.map.road.sum()),
         events_appeared=appeared,
         events_cleared=cleared,
@@ -96,6 +96,12 @@ def episode_facts(world: World, episode: Episode) -> EpisodeFacts:
         epsilon=episode.epsilon,
         updates=episode.updates,
     )
+
+
+def _of_known(values: NDArray[Any]) -> float:
+    """The mean of what is known; 0.0 where nothing is, as in an episode whose UAVs were all lost at its start."""
+    known = values[~np.isnan(values)] if values.dtype.kind == "f" else values
+    return float(known.mean()) if known.size else 0.0
 
 
 def event_facts(world: World, episode: Episode) -> tuple[int | None, int | None, float | None]:

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tmc.kernel.config import Config
 
+SIGHTINGS = 1_000_000
+"""Most sightings of a flight record (`tmc.wire.messages.Record`)."""
+
 # (key, lowest, highest): ranges that hold whatever the rest says.
 RANGES: tuple[tuple[str, float, float], ...] = (
     ("scenario", 1, 2),
@@ -69,6 +72,9 @@ def _complaints(config: Config) -> Iterator[str]:
         value = attrgetter(key)(config)
         if not low <= value <= high:
             yield f"{key} = {value} is out of range: choose {low:,.10g} to {high:,.10g}"
+    near = min(config.team.size, int(2 * config.team.sensing_range + 1) ** 2) - 1
+    if near * (min(config.T_u, config.training.ticks) + 1) > SIGHTINGS:
+        yield f"a record could hold more than {SIGHTINGS:,} sightings: lower team.sensing_range, or comms.period"
     if not config.network.channels or any(not 1 <= c <= 4096 for c in config.network.channels):
         yield "network.channels must list 1 to 4096 filters for at least one convolution"
     if config.replay.learn_start > config.replay.capacity:

@@ -164,12 +164,14 @@ class SampleRequest(Message):
     """One minibatch, please. `request` comes back in the answer.
 
     `index`, `errors`: the transitions of a minibatch that was just learned from, by number, and |Q - y| of each, which
-    is their priority from now on; both empty before the first one and where `replay.priority` is 0.
+    is their priority from now on; both empty before the first one and where `replay.priority` is 0. `life`: of the
+    learner's process, as in `Hello`; 0 where there is only one.
     """
 
     request: int = f.integer(0, 2**62)
     index: Array = f.array("<i8", 65_536, empty=True)
     errors: Array = f.array("<f4", 65_536, empty=True)
+    life: int = f.integer(0, 2**63 - 1, default=0)
 
 
 @dataclass(frozen=True)
@@ -199,13 +201,17 @@ class Minibatch(Message):
 
 @dataclass(frozen=True)
 class PolicyPush(Message):
-    """The learner's policy after `updates` updates; a version that is not newer is refused. `sent`: as in `Record`."""
+    """The learner's policy after `updates` updates; a version that is not newer is refused.
+
+    `sent`: as in `Record`; `life`: as in `SampleRequest`.
+    """
 
     version: int = f.integer(1, 2**62)
     updates: int = f.integer(0, 2**62)
     loss: float = f.real(-1e30, 1e30)
     model: bytes = f.blob(64 * 1024 * 1024)
     sent: int = f.integer(0, 2**63 - 1, default=0)
+    life: int = f.integer(0, 2**63 - 1, default=0)
 
 
 @dataclass(frozen=True)
@@ -272,10 +278,14 @@ class Bye(Message):
 
 @dataclass(frozen=True)
 class Error(Message):
-    """What was wrong with your frame, and the mend. Nothing was changed by it."""
+    """What was wrong with your frame, and the mend. Nothing was changed by it.
+
+    `life`: of the process that sent the frame, where it told: another one may have its name by now.
+    """
 
     code: str = f.choice("malformed", "version", "unknown", "range", "state", "fenced", "refused")
     text: str = f.text(1024)
+    life: int = f.integer(0, 2**63 - 1, default=0)
 
 
 MESSAGES: tuple[type[Message], ...] = (

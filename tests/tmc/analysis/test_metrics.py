@@ -7,15 +7,19 @@ import shutil
 import numpy as np
 import pytest
 
+from deploy import cli
+from deploy.lockstep import LockStep
 from tmc.analysis.flown import read
 from tmc.analysis.metrics import event_waits, summarize, summary
-from tmc.kernel.config import Journal, build
+from tmc.journal import Journal as TmcJournal
+from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
 from tmc.record import facts, schemas
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
+from tmc.wire.messages import Hello
 
 SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 
@@ -268,3 +272,32 @@ def test_reading_changes_nothing(fly):
     summarize(read(folder))
     assert {p: p.stat().st_mtime_ns for p in folder.rglob("*.mcap")} == before
     assert Log(folder / "tmc.mcap").finished
+
+
+@pytest.mark.parametrize("ticks", [0, 20])
+def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, tmp_path):
+    """UAV 1 is gone from the first episode's start on; with `ticks` 0, so is UAV 0 in the second."""
+    config = build({"team.size": 2, "team.pilot": "planner:greedy", "training.episodes": 2, "training.ticks": 20})
+    (tmp_path / "config.json").write_text(json.dumps(flat(config)))
+    journal = TmcJournal(tmp_path, world := World(config), "run")
+    mission = LockStep(world, None, journal.take)
+    for i in (0, 1):
+        for to, message in mission._exchange(i, Hello("uav", i, 1)):
+            mission.fleet.deliver(to, message)
+    mission.fleet.pilots[1].advance = lambda: None
+    station, now = mission.station, 100.0
+    while station.episodes < 2:
+        while (station.episodes == 0 or ticks) and mission.fleet.step():
+            pass
+        now += 100.0
+        station.roster[0].heard = now if station.episodes == 0 or ticks else 0.0
+        station.tick(now)
+        for to, message in mission._take():
+            mission.fleet.deliver(to, message)
+    journal.writer.close()
+    s = summary(tmp_path)
+    last = s.episodes[-1]
+    assert (last.reward, last.on_road) == (0.0, 0.0) if not ticks else (last.reward > 0.0 and last.on_road == 1.0)
+    assert json.loads(s.to_json())["episodes"][0]["ticks"] == 20
+    assert cli.main(["analyze", str(tmp_path)]) == 0
+    assert (tmp_path / "report" / "paths.png").stat().st_size > 1000

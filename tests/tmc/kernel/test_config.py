@@ -265,6 +265,10 @@ def test_both_ends_of_a_range_are_taken(key: str, low: float, high: float) -> No
         ({"dqn.target_episodes": 0}, "the target would never follow"),
         ({"observation.near": 1}, "needs observation.view = ego"),
         (
+            {"team.size": 300, "team.sensing_range": 100.0, "comms.period": 4000, "training.ticks": 4000},
+            "a record could hold more than 1,000,000 sightings",
+        ),
+        (
             {"observation.view": "ego", "observation.radius": 2, "observation.near": 3},
             "observation.near is larger than observation.radius",
         ),
