@@ -276,7 +276,7 @@ def test_reading_changes_nothing(fly):
 
 @pytest.mark.parametrize("ticks", [0, 20])
 def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, tmp_path):
-    """UAV 1 is gone from the first episode's start on; with `ticks` 0, so is UAV 0 in the second."""
+    """UAV 1 is gone from the first episode's start on; with `ticks` 0, so is UAV 0 after the start of the second."""
     config = build({"team.size": 2, "team.pilot": "planner:greedy", "training.episodes": 2, "training.ticks": 20})
     (tmp_path / "config.json").write_text(json.dumps(flat(config)))
     journal = TmcJournal(tmp_path, world := World(config), "run")
@@ -289,6 +289,7 @@ def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, t
     while station.episodes < 2:
         while (station.episodes == 0 or ticks) and mission.fleet.step():
             pass
+        mission.fleet.step()
         now += 100.0
         station.roster[0].heard = now if station.episodes == 0 or ticks else 0.0
         station.tick(now)
