@@ -149,7 +149,7 @@ def uncertainty_picture(flown: Flown, summary: Summary, shown: Episode, path: Pa
         label = "other episodes" if i == 0 else None
         axes.plot(episode.uncertainty, color="#BBBBBB", linewidth=0.7, label=label)
     axes.plot(shown.uncertainty, color=style.BLUE, linewidth=1.3, label=f"episode {shown.number}")
-    mean = float(np.nanmean(shown.uncertainty[1:]))
+    mean = next(facts.uncertainty for facts in summary.episodes if facts.episode == shown.number)
     axes.axhline(mean, color=style.ORANGE, linestyle="--", linewidth=1.5, label=f"its mean, eq. (6): {mean:.1f}")
     if summary.lower_bound is not None:
         label = f"lower bound of the mean: {summary.lower_bound:.1f}"

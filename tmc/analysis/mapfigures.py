@@ -104,8 +104,10 @@ def _path(axes: Any, road_map: RoadMap, cells: Cells, uav: int, team: int) -> Li
     points = np.stack(_xy(road_map, cells), axis=1) + np.array([shift, -shift])
     age = np.linspace(0.25, 1.0, max(len(points) - 1, 0))
     pieces = list(np.stack((points[:-1], points[1:]), axis=1))
-    axes.add_collection(LineCollection(pieces, colors="white", linewidths=1.2 + 2 * age, alpha=age * 0.9, zorder=3))
-    axes.add_collection(LineCollection(pieces, colors=colour, linewidths=0.6 + 1.4 * age, alpha=age, zorder=4))
+    if pieces:
+        edge = LineCollection(pieces, colors="white", linewidths=1.2 + 2 * age, alpha=age * 0.9, zorder=3)
+        axes.add_collection(edge)
+        axes.add_collection(LineCollection(pieces, colors=colour, linewidths=0.6 + 1.4 * age, alpha=age, zorder=4))
     axes.scatter(*points[0], s=26, marker=shape, facecolor="white", edgecolor=colour, linewidth=1.4, zorder=5)
     axes.scatter(*points[-1], s=80, marker=shape, facecolor=colour, edgecolor="white", linewidth=1.2, zorder=6)
     return _marker(shape, colour, f"UAV {uav}")
