@@ -29,7 +29,6 @@ class RadioTracks:
         self._reach = max(grid.size if math.isinf(sensing) else math.floor(sensing), 1)
         self._episode = 0
         self._early: list[Beacon] = []
-        self.sent = 0
 
     def begin(self, episode: int, starts: list[int]) -> None:
         self._episode = episode
@@ -69,7 +68,6 @@ class RadioTracks:
         """Send the own track from tick `start` on, if there is any yet."""
         own = self._known[self.uav]
         cells = np.array(own[start:], "<u2")
-        self.sent += 1
         self._send(Beacon(self.uav, self._episode, start, cells, np.array(to, "<u2"), ask))
         for j in to:
             self._told[j] = len(own) - 1

@@ -20,7 +20,12 @@ def target(reward: Tensor, discount: Tensor, q_next: Tensor, allowed: Tensor, q_
 
     There is no terminal term: an episode ends by a time limit, which is no state of the world, so y always bootstraps.
     """
-    return (reward + discount * value(q_next, allowed, q_choice)).detach()
+    return bootstrap(reward, discount, value(q_next, allowed, q_choice)).detach()
+
+
+def bootstrap(reward: Tensor, discount: Tensor, worth: Tensor) -> Tensor:
+    """Eq. (8) where what o' is worth is known: r + gamma^n `worth`. All of shape (B,)."""
+    return reward + discount * worth
 
 
 def value(q_next: Tensor, allowed: Tensor, q_choice: Tensor | None = None) -> Tensor:

@@ -99,7 +99,7 @@ class Trainer:
 
     @torch.no_grad()
     def _target(self, batch: Batch, values: Floats, rest: Ints) -> Tensor:
-        """y of eq. (8), of scaled rewards: `dqn.target`; `values` (B,) are those of o', but for the rows `rest`."""
+        """y of eq. (8), of scaled rewards, as `dqn.target`; `values` (B,) are those of o', but for the rows `rest`."""
         if rest.size:
             o_next, allowed = laid_out(batch.next_observation(rest)), torch.tensor(batch.allowed[rest])
             choice = self.online(o_next) if self.config.dqn.double else None
@@ -107,7 +107,7 @@ class Trainer:
             if choice is None:  # a value that theta has chosen changes with every update
                 self._known.keep(batch.index[rest], values[rest])
         reward = torch.tensor(batch.reward) * self.config.dqn.reward_scale
-        return reward + torch.tensor(batch.discount) * torch.from_numpy(values)
+        return dqn.bootstrap(reward, torch.tensor(batch.discount), torch.from_numpy(values))
 
     def judged(self) -> tuple[NDArray[np.int64], Floats]:
         """The transitions of the last update, by number, and |Q - y| of each; told once. Shapes (B,), or empty.
@@ -151,9 +151,9 @@ class Trainer:
         self.target.load_state_dict(self.online.state_dict())
         self._known.forget()
 
-    def policy(self, after: int = 0) -> tuple[int, bytes]:
-        """A policy file of theta, with a version newer than any before and than `after`."""
-        self.version = max(self.version, after) + 1
+    def policy(self) -> tuple[int, bytes]:
+        """A policy file of theta, with a version newer than any before."""
+        self.version += 1
         return self.version, to_onnx(self.online, card_for(self.config, self.grid, self.version, self.updates))
 
     def _tensors(self) -> dict[str, Tensor]:

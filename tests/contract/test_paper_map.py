@@ -13,7 +13,7 @@ from tmc.kernel.config import SETTINGS
 
 ROOT = Path(__file__).parents[2]
 PAPER_MAP = (ROOT / "docs" / "paper-map.md").read_text("utf-8")
-PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("docs/**/*.md"), ROOT / "CONTRIBUTING.md"))
+PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("docs/**/*.md"), *ROOT.glob("*.md")))
 LAWS = "Laws without a number (Sec. II-B to II-D)"
 PATH = re.compile(r"`((?:actors|deploy|docs|learner|tests|tmc)/[\w./-]*)(?:(::|:)([\w.]+))?`")
 

@@ -59,7 +59,8 @@ def test_resuming_gives_the_same_weights_bit_for_bit(tmp_path, preset, trainer_o
 
 def test_counters_and_versions_come_back(tmp_path, trained):
     trainer, other = trained(3), trained(0)
-    trainer.policy(after=11)
+    trainer.version = 11
+    trainer.policy()
     go_on(checkpoint.save(tmp_path, trainer), other)
     assert (other.updates, other.version) == (3, 12)
     assert other.policy()[0] == 13
