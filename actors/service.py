@@ -24,7 +24,8 @@ from tmc.kernel.config import build
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
 from tmc.record.builders import location_fix
-from tmc.record.channels import uav_topic
+from tmc.record.channels import ACTIVE, uav_topic
+from tmc.record.reader import Log
 from tmc.record.schemas import UavStatus
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
@@ -50,6 +51,12 @@ class Left(Exception):  # noqa: N818  not an error: the flight is over
     def __init__(self, code: int, text: str) -> None:
         super().__init__(text)
         self.code = code
+
+
+def another_mission(path: Path, run: str) -> bool:
+    """Whether a log that is there, and would be gone on with, is of another mission than `run`."""
+    there = [log for log in (path.with_name(path.name + ACTIVE), path) if log.is_file() and log.stat().st_size]
+    return bool(there) and Log(there[0]).metadata().get("run", run) != run
 
 
 class Service:
@@ -114,6 +121,8 @@ class Service:
             raise Left(process.USAGE, f"the map '{config.world.map}' here is not the one that the TMC flies: copy it")
         self.out.mkdir(parents=True, exist_ok=True)
         path = self.out / f"uav-{self.uav:03d}.mcap"
+        if another_mission(path, welcome.run):
+            raise Left(process.USAGE, f"{path} is the log of another mission: choose another --out")
         self.log = LogWriter(path, f"uav-{self.uav:03d}", config.journal, {"run": welcome.run}, resume=True)
         observer, team = Observer(world), config.team.size
         tracks: Tracks

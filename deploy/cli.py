@@ -10,8 +10,12 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from tmc.wire import process
+
+LEARNERS_OWN = ("torch", "safetensors")
+"""Packages that only a learner needs."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,11 @@ def parser_for(chosen: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def interrupt(number: int, _frame: FrameType | None) -> None:
+    """SIGTERM and SIGHUP end a command in order, as Ctrl-C does."""
+    raise KeyboardInterrupt(number)
+
+
 def check_install() -> None:
     """The four packages have plain names: make sure that they are ours, side by side in one folder."""
     origins = [(importlib.util.find_spec(name), name) for name in ("actors", "learner", "tmc", "deploy")]
@@ -95,15 +104,23 @@ def main(argv: list[str] | None = None) -> int:
     def run() -> int:
         check_install()
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, interrupt)
         return int(module.main(args))
 
     try:
         return process.run(run, mistakes())
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough
+    except KeyboardInterrupt as stopped:
+        return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+    except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough; we are not done, though
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return 128 + signal.SIGPIPE
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in LEARNERS_OWN:
+            raise
+        mend = "in the folder of Overfly, run pip install '.[learner]'"
+        print(f"overfly: {error.name} is not installed, and a learner needs it: {mend}", file=sys.stderr)
+        return process.USAGE
     except OSError as error:  # a full disk, a folder that was removed
         print(f"overfly: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return process.FAILED

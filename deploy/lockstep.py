@@ -67,6 +67,8 @@ class LockStep:
         pilots = [pilot(i) for i in range(config.team.size)]
         self.fleet = Fleet(pilots, self._exchange)
         self._minibatches: list[m.Minibatch] = []
+        self._loss, self.final = 0.0, b""
+        """Of the last update, and the policy file that was learned, once all has been."""
         if trainer is not None:
             from learner.intake import Intake  # noqa: PLC0415  torch only where something is learned
 
@@ -103,22 +105,25 @@ class LockStep:
         while self.fleet.step() | self._learn():
             if show is not None:
                 show(status(self.station))
+        if self.trainer is not None:
+            self.final = self._push(self._loss)  # what a learner's process says last
 
     def _learn(self) -> bool:
         """Train on every minibatch that the limiter lets through; True when there was one."""
         trainer, learned = self.trainer, False
         while trainer is not None and self._minibatches:
             metrics = trainer.update(self._intake.read(self._minibatches.pop(0)))
-            learned = True
+            learned, self._loss = True, metrics.loss
             if metrics.updates % self.world.config.training.push_every == 0:
                 self._push(metrics.loss)
             self._tell(m.SampleRequest(metrics.updates, *trainer.judged()))
         return learned
 
-    def _push(self, loss: float = 0.0) -> None:
+    def _push(self, loss: float = 0.0) -> bytes:
         assert self.trainer is not None
         version, model = self.trainer.policy()
         self._tell(m.PolicyPush(version, self.trainer.updates, loss, model))
+        return model
 
 
 def _decider_maker(world: World, observer: Observer) -> Callable[[bytes], Decider]:
@@ -152,7 +157,7 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
         if trainer is not None:
             from learner.service import write_policy  # noqa: PLC0415
 
-            write_policy(out / "policies" / "final.onnx", trainer.policy()[1])
+            write_policy(out / "policies" / "final.onnx", mission.final)
     finally:
         journal.writer.close()
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import platform
+import shlex
 import signal
 import sys
 import time
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
@@ -18,7 +18,7 @@ from actors.tracks import create_table
 from deploy import lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
-from tmc.analysis.setting import config_of
+from tmc.analysis.setting import attachments, config_of
 from tmc.journal import journal_in
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.policy import check_view, view_shape
@@ -95,9 +95,12 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
         print(f"overfly: {text}, and `overfly log recover` says what else is in it", file=sys.stderr)
     file = flown_policy(out)
     policy = file.read_bytes() if file.exists() else None
+    world = check(config, policy)
+    if attachments(journal).get("map.csv", world.map.csv()) != world.map.csv():
+        raise ConfigError(f"the map {config.world.map} has changed since the run was begun: put it back as it was")
     if log.metadata().get("run") == lockstep.RUN and policy is None and not who.is_planner(config):
         raise ConfigError(f"{out} was trained in lock step, which leaves no checkpoint to go on from: run it again")
-    return check(config, policy), policy
+    return world, policy
 
 
 def keep_settings(out: Path, config: Config, policy: bytes | None) -> Path | None:
@@ -116,11 +119,17 @@ def keep_settings(out: Path, config: Config, policy: bytes | None) -> Path | Non
 
 def finished(out: Path) -> bool:
     """True when the processes of the run in `out` came to its end, all of them in order."""
-    try:
-        codes = json.loads((out / "run.json").read_text()).get("exit_codes", {})
-    except (OSError, ValueError, AttributeError):
-        return False
+    codes = _told(out).get("exit_codes", {})
     return set(codes.values()) == {0} and (out / "tmc.mcap").exists()
+
+
+def _told(out: Path) -> dict[str, Any]:
+    """What `run.json` says; nothing where it is gone or broken."""
+    try:
+        told = json.loads((out / "run.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
 
 
 class Mission:
@@ -133,14 +142,12 @@ class Mission:
         self.world, self.config, self.out, self.command = world, config, out, command
         self.policy = keep_settings(out, config, policy)
         self.progress = progress or Progress(config, self.world.law.cells.size, bound_of(self.world))
-        self._start = time.time()
+        self._begun, self._start = _told(out), time.time()
         self._ended: dict[str, Any] = {}
         self._write_run(self._ended)
 
     def run(self, *, in_one_process: bool) -> int:
         """Fly it; returns the exit code. What it left is in the run folder either way."""
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, _interrupt)
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
@@ -153,7 +160,7 @@ class Mission:
             return process.FAILED
         except KeyboardInterrupt as stopped:
             self.progress.note(f"stopped; what was flown is in {self.out}")
-            return process.STOPPED if stopped.args else 130
+            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
         finally:
             self.progress.clear()
             self._write_run(self._ended)
@@ -188,9 +195,10 @@ class Mission:
             self._ended["sealed"] = {"before": sealed.before, "after": sealed.after}
 
     def _write_run(self, more: dict[str, Any]) -> None:
-        """`run.json`: what was run, with which versions, and how each process ended."""
+        """`run.json`: what was run, and resumed, with which versions, and how each process ended."""
         facts = {
-            "command": self.command,
+            "command": self._begun.get("command", self.command),
+            "resumed": [*self._begun.get("resumed", []), *([self.command] if self._begun else [])],
             "overfly": version("overfly"),
             "python": platform.python_version(),
             "platform": platform.platform(),
@@ -203,11 +211,6 @@ class Mission:
             self.progress.note(f"cannot write {self.out / 'run.json'}: {error.strerror}")
 
 
-def _interrupt(number: int, _frame: FrameType | None) -> None:
-    """SIGTERM ends a mission in order, as Ctrl-C does."""
-    raise KeyboardInterrupt(number)
-
-
 def command_line() -> str:
     """The command as the user typed it."""
-    return " ".join(["overfly", *sys.argv[1:]])
+    return shlex.join(["overfly", *sys.argv[1:]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,8 @@ SILENCE = 1.0
 """Seconds without a minibatch after which the learner says hello again: the TMC may have been started anew."""
 METRICS_EVERY = 0.2
 """Seconds between two metrics messages in the log."""
+TELL_EVERY = 5.0
+"""Seconds between two lines that say that no TMC answers."""
 
 
 class ReplacedError(Exception):
@@ -41,7 +44,7 @@ class Service:
     """The learner of the mission that the TMC at `endpoint` runs; logs, checkpoints and policies go to `out`."""
 
     def __init__(self, endpoint: str, out: Path) -> None:
-        self.out = out
+        self.endpoint, self.out = endpoint, out
         self.life = int.from_bytes(os.urandom(7), "big")
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, sockets.feed_endpoint(endpoint), "learner")
@@ -51,6 +54,8 @@ class Service:
         self._hailed = False
         self._idle = 0.0
         self._metrics_due = 0.0
+        self._untold: tuple[UpdateMetrics, m.Minibatch] | None = None
+        """The last update, while the log has not got it."""
         self._loss = 0.0
 
     def learn(self, stop: Callable[[], bool]) -> bool:
@@ -76,7 +81,11 @@ class Service:
 
     def _join(self, saved: Saved | None, stop: Callable[[], bool]) -> m.Welcome | m.End | None:
         """Say hello until the TMC answers; None when stopped before."""
+        told = time.monotonic()
         while not stop():
+            if time.monotonic() - told > TELL_EVERY:
+                told = time.monotonic()
+                print(f"overfly: the learner waits for a TMC at {self.endpoint}", file=sys.stderr, flush=True)
             sockets.send(self.sock, m.Hello("learner", -1, self.life, saved.meta.updates if saved else 0))
             if self.sock.poll(1000):
                 message = self._receive()
@@ -179,8 +188,15 @@ class Service:
 
     def _report(self, metrics: UpdateMetrics, minibatch: m.Minibatch) -> None:
         now = time.monotonic()
-        if now < self._metrics_due or self.log is None:
+        self._untold = (metrics, minibatch)
+        if now >= self._metrics_due:
+            self._tell(now)
+
+    def _tell(self, now: float) -> None:
+        """What the last update did, for the log."""
+        if self._untold is None or self.log is None:
             return
+        (metrics, minibatch), self._untold = self._untold, None
         span = max(now - self._told, 1e-9)
         self.log.write("/learner/metrics", LearnerMetrics(
             updates=metrics.updates, episode=minibatch.episodes, steps=minibatch.ticks * self.config.team.size,
@@ -192,7 +208,8 @@ class Service:
         self._metrics_due = now + METRICS_EVERY
 
     def _finish(self) -> None:
-        """The last checkpoint, the last policy, and its file."""
+        """The last metrics, the last checkpoint, the last policy, and its file."""
+        self._tell(time.monotonic())
         checkpoint.save(self.out / "checkpoints", self.trainer)
         write_policy(self.out / "policies" / "final.onnx", self._push())
         sockets.send(self.sock, m.Bye("learner", -1, f"{self.trainer.updates} updates"))

@@ -92,14 +92,14 @@ def main(args: argparse.Namespace) -> int:
 def team_sizes(listed: str | None) -> list[int | None]:
     """The team sizes of `--actors 1,3,10`; [None] for the mission's own."""
     try:
-        return [None] if listed is None else [int(n) for n in listed.split(",")]
+        return [None] if listed is None else [*dict.fromkeys(int(n) for n in listed.split(","))]
     except ValueError:
         raise ConfigError(f"--actors {listed} is no list of numbers: write for example --actors 1,3,10") from None
 
 
 def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | None]]:
     """(WHO, config, policy) of every mission, checked before the first one flies."""
-    pilots = [who.resolve(name) for name in args.who]
+    pilots = [who.resolve(name) for name in dict.fromkeys(args.who)]
     shared = shared_world(pilots, {*settings.chosen(args), *(["team.size"] if args.actors else [])})
     for pilot in pilots:
         for n in team_sizes(args.actors):

@@ -57,6 +57,8 @@ def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
     out: Path | None = args.out
     if out is not None and out.suffix.lower() != ".png":
         raise MapError(f"--out {out} is no PNG: give a name that ends in .png")
+    if out is not None and out.exists():
+        raise MapError(f"{out} exists already: choose another --out, or remove it")
     print(drawing(road_map))
     if out is not None:
         _picture(road_map, out)

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 import zmq
 
-from actors.service import Left, Service
-from tmc.kernel.config import build, flat
+from actors.service import Left, Service, another_mission
+from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
+from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 from tmc.wire import process, sockets
 from tmc.wire.codec import decode
@@ -76,3 +77,12 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
     finally:
         service.close()
         context.destroy(linger=0)
+
+
+def test_the_log_of_another_mission_is_not_gone_on_with(tmp_path: Path) -> None:
+    path = tmp_path / "uav-000.mcap"
+    assert not another_mission(path, "a")
+    LogWriter(path, "uav-000", Journal(), {"run": "a"}).close()
+    assert not another_mission(path, "a") and another_mission(path, "b")
+    path.rename(tmp_path / "uav-000.mcap.active")
+    assert another_mission(path, "b")

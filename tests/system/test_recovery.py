@@ -179,6 +179,31 @@ def test_a_training_in_lock_step_is_never_learned_anew(tmp_path: Path, capsys: p
     assert main(["run", "--resume", str(out)]) == 2
     assert "was trained in lock step, which leaves no checkpoint to go on from" in capsys.readouterr().err
     assert (out / "policies" / "final.onnx").read_bytes() == policy
+    last = [e.message for e in Log(out / "tmc.mcap").entries(["/learner/policy"])][-1]
+    assert last.model == policy and last.updates == 60  # of 80 ticks; at tick 20, 30 transitions are in
+
+
+def test_a_map_that_has_changed_is_not_flown_on_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    town, out = tmp_path / "town.txt", tmp_path / "R"
+    town.write_text("#####\n#...#\n#####\n")
+    fly = ("fly", "planner:greedy", "--lockstep", "--actors", "2", "--ticks", "20", "--map", str(town), "--no-pictures")
+    assert main([*fly, "--out", str(out)]) == 0
+    (out / "run.json").unlink()
+    town.write_text("#####\n#.#.#\n#####\n")
+    assert main(["run", "--resume", str(out)]) == 2
+    assert "has changed since the run was begun: put it back as it was" in capsys.readouterr().err
+    town.write_text("#####\n#...#\n#####\n")
+    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0
+
+
+def test_the_first_command_of_a_run_is_kept(tmp_path: Path) -> None:
+    out = tmp_path / "R"
+    assert main(["fly", "planner:greedy", "--lockstep", "--ticks", "20", "--no-pictures", "--out", str(out)]) == 0
+    told = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(told | {"exit_codes": {}, "command": "overfly fly planner:greedy"}))
+    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0
+    again = json.loads((out / "run.json").read_text())
+    assert again["command"] == "overfly fly planner:greedy" and len(again["resumed"]) == 1
 
 
 def test_an_empty_config_keeps_nobody_from_going_on(tmp_path: Path) -> None:

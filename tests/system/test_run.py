@@ -75,6 +75,38 @@ def test_the_mend_that_evaluate_names_is_one(here, tmp_path: Path) -> None:
     assert here(*both, "--set", "comms.period=10").returncode == 0
 
 
+def test_who_is_named_twice_is_flown_once(here) -> None:
+    once, twice = (
+        here("evaluate", *who, "--seeds", 2, "--ticks", 20, "--json", "--jobs", 1).stdout
+        for who in (["planner:random"], ["planner:random"] * 2)
+    )
+    same = [{k: v for k, v in json.loads(text).items() if k != "seconds"} for text in (once, twice)]
+    assert same[0] == same[1]
+
+
+def test_a_signal_ends_an_evaluation_and_all_its_processes(running, tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-m", "deploy.cli", "evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as run:
+        assert run.stderr is not None and "missions" in run.stderr.readline()
+        workers = [int(pid) for pid in Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()]
+        run.terminate()
+        assert run.wait(30) == 143
+    until = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert workers and not any(Path(f"/proc/{pid}").exists() for pid in workers)
+
+
+def test_a_check_whose_reader_leaves_did_not_succeed(here, tmp_path: Path) -> None:
+    assert here(*GREEDY, "--lockstep", "--ticks", 400, "--out", tmp_path / "R").returncode == 0
+    command = [sys.executable, "-P", "-m", "deploy.cli", "log", "cat", str(tmp_path / "R")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as cat:
+        assert cat.stdout is not None and cat.stderr is not None
+        cat.stdout.readline()
+        cat.stdout.close()
+        assert (cat.wait(30), cat.stderr.read()) == (141, b"")
+
+
 def test_a_run_folder_that_exists_is_refused(here, tmp_path: Path) -> None:
     out = tmp_path / "R"
     out.mkdir()

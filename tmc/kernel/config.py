@@ -204,10 +204,12 @@ class Config:
         return min(t + (self.phase(uav) - t) % self.T_u, self.training.ticks)
 
     def epsilon(self, episode: int) -> float:
-        """Exploration rate of an episode (counted from 1): linear over the first `fraction` of all episodes."""
+        """Exploration rate of an episode (counted from 1): linear over the first `fraction` of all episodes.
+
+        It is `end` from episode 1 + fraction * (E - 1) on, so in all of them where there is no room to fall.
+        """
         e, span = self.exploration, self.exploration.fraction * (self.training.episodes - 1)
-        done = 1.0 if span <= 0 else min((episode - 1) / span, 1.0)
-        return e.start + (e.end - e.start) * done
+        return e.end if episode - 1 >= span else e.start + (e.end - e.start) * (episode - 1) / span
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,8 @@ def _choice(setting: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def _read(path: str) -> str:
+    if Path(path).is_fifo():
+        raise MapError(f"{path} is a pipe: give the path of a text raster")
     try:
         with Path(path).open("rb") as file:
             raw = file.read(MAX_BYTES + 1)

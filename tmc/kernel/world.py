@@ -63,6 +63,12 @@ class World:
             raise ConfigError(f"team.size = {size} is larger than the {self.start_cells.size} cells to start on")
         if self.config.replay.capacity < size:
             raise ConfigError(f"replay.capacity = {self.config.replay.capacity} is less than a tick of {size} UAVs")
+        held, needed = self.config.replay.capacity // size * size, self.config.replay.learn_start
+        if needed > held:
+            raise ConfigError(
+                f"replay.learn_start = {needed} is larger than the {held} transitions that replay.capacity holds, in "
+                f"whole ticks of {size} UAVs, so learning would never start: raise capacity, or lower learn_start"
+            )
         if not self.law.cells.size:
             raise ConfigError(f"no cell of {self.map.name} is monitored: every rate is 0")
 

@@ -132,6 +132,8 @@ class Log:
 
 
 def _check_start(path: Path) -> None:
+    if path.is_fifo():
+        raise RecordError(f"{path} is a pipe: give the file of a log")
     try:
         with path.open("rb") as file:
             start = file.read(len(MAGIC))

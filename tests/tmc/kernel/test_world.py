@@ -72,6 +72,13 @@ def test_starts_are_distinct_and_allowed(start: str, world_of: Worlds) -> None:
         assert allowed[cells].all()
 
 
+def test_a_memory_in_which_learning_cannot_start_is_refused(world_of: Worlds) -> None:
+    """It holds whole ticks of the team: 126 transitions of 3 UAVs, where 128 are room for."""
+    world_of({"team.size": 3, "replay.capacity": 128, "replay.learn_start": 126})
+    with pytest.raises(ConfigError, match=r"larger than the 126 transitions that replay\.capacity holds"):
+        world_of({"team.size": 3, "replay.capacity": 128, "replay.learn_start": 127})
+
+
 def test_starts_differ_by_episode_and_seed_and_repeat(world_of: Worlds) -> None:
     one, other = world_of({"team.size": 6}), world_of({"team.size": 6, "training.seed": 2})
     assert one.starts(3) == one.starts(3) == world_of({"team.size": 6}).starts(3)
