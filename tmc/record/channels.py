@@ -39,8 +39,12 @@ CHANNELS: tuple[Channel, ...] = (
     Channel("/tmc/metrics", "overfly.TeamMetrics", "tmc", "uncertainty of the true map and the team's reward by tick"),
     Channel("/tmc/last_visit", "foxglove.Grid", "tmc", "tick of the last visit of each cell, uint32"),
     Channel("/map/roads", "foxglove.GeoJSON", "tmc", "the road network, once"),
-    Channel("/learner/policy", "overfly.Policy", "tmc", "each policy accepted; the last one with its ONNX model"),
-    Channel("/learner/metrics", "overfly.LearnerMetrics", "learner", "loss, Q values and pace of learning"),
+    Channel(
+        "/learner/policy", "overfly.Policy", "tmc", "each policy accepted; with its ONNX model from a training's end on"
+    ),
+    Channel(
+        "/learner/metrics", "overfly.LearnerMetrics", "learner", "loss, Q values and pace of learning, now and then"
+    ),
     Channel("/uav/<id>/status", "overfly.UavStatus", "uav", "where the UAV is, how fast it flies, how long it waited"),
     Channel("/uav/<id>/witness", "overfly.Witness", "uav", "in trials: a hash of each observation decided on"),
     Channel("/uav/<id>/fix", "foxglove.LocationFix", "uav", "position in degrees, sampled"),
