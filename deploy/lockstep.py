@@ -167,7 +167,7 @@ def _run(mission: LockStep, show: Callable[[m.Status], None]) -> None:
     if mission.trainer is None:
         mission.run(show)
         return
-    from learner.intake import TrainingError  # noqa: PLC0415
+    from learner.intake import TrainingError  # noqa: PLC0415  torch only where something is learned
 
     try:
         mission.run(show)

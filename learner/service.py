@@ -52,6 +52,7 @@ class Service:
         self._request, self._flying = 0, set[int]()
         """The number of the last request for a minibatch, and the requests in flight."""
         self._hailed = False
+        """Whether a Hello went out since the last Welcome that was acted on."""
         self._idle = 0.0
         self._metrics_due = 0.0
         self._untold: tuple[UpdateMetrics, m.Minibatch] | None = None
