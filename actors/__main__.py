@@ -31,7 +31,7 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
     except Left as left:
         service.say(messages.Bye("uav", uav, str(left)))
         if left.code not in {process.DONE, process.STOPPED}:
-            print(f"overfly: UAV {uav}: {left}", file=sys.stderr)
+            process.tell(f"UAV {uav}: {left}")
         return stop.code if left.code == process.STOPPED else left.code
     finally:
         service.close()
@@ -45,8 +45,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder for the UAV's log")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args(argv)
-    process.die_with_parent(a.parent)
-    return process.run(lambda: fly(a.id, a.connect, a.out), MISTAKES)
+    process.become_child(a.parent)
+    return process.run_child(lambda: fly(a.id, a.connect, a.out), MISTAKES)
 
 
 if __name__ == "__main__":

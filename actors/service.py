@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -38,8 +37,6 @@ ASK_EVERY = 0.2
 """Seconds after which a UAV that waits for a peer's beacon asks for it, and asks again."""
 STATUS_EVERY = 0.5
 """Seconds between two status messages in the log."""
-TELL_EVERY = 5.0
-"""Seconds between two lines that say that no TMC answers."""
 NAP = 0.02
 """Seconds that a wait for a peer's track sleeps before it looks at what the TMC sent; ten times as long in a long wait,
 which costs less than 1 % of a core."""
@@ -68,6 +65,7 @@ class Service:
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, endpoint, f"uav-{uav:03d}")
         self.log: LogWriter | None = None
+        self.reminder = process.Reminder()
         self.waited, self._peer = 0.0, -1
         self.table: TableTracks | None = None
         self.lead: Lead | None = None
@@ -81,6 +79,7 @@ class Service:
         self.pilot, self.radio = self._join(stop)
         pilot, naps = self.pilot, 0
         while not stop():
+            self._remind()
             try:
                 record = pilot.advance()
             except Waiting as waiting:
@@ -98,11 +97,10 @@ class Service:
 
     def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
         """Say hello until the TMC answers, and build the pilot of the mission that it names."""
-        hello, told = m.Hello("uav", self.uav, self.life), time.monotonic()
+        hello = m.Hello("uav", self.uav, self.life)
         while not stop():
-            if time.monotonic() - told > TELL_EVERY:
-                told = time.monotonic()
-                print(f"overfly: UAV {self.uav} waits for a TMC at {self.endpoint}", file=sys.stderr, flush=True)
+            if self.reminder.due():
+                process.note(f"UAV {self.uav} waits for a TMC at {self.endpoint}")
             self.say(hello)
             if self.sock.poll(int(SILENCE[0] * 1000)):
                 message = self._receive()
@@ -147,6 +145,19 @@ class Service:
         planner: Decider | None = PlannerDecider(world, who) if who.startswith(PREFIX) else None
         planner = witness.watch(planner) if witness and planner else planner
         return Pilot(world, self.uav, self.life, tracks, observer, decider, planner, time.time_ns), radio
+
+    def _remind(self) -> None:
+        """Ask the TMC for what the mission waits, where this UAV has not moved for some seconds, and tell."""
+        if self.reminder.due(self.pilot.steps):
+            if self.reminder.asked:
+                process.note(f"UAV {self.uav} waits for an answer of the TMC at {self.endpoint}")
+            self.reminder.asked = True
+            self.say(m.StatusRequest())
+
+    def _on_status(self, status: m.Status) -> None:
+        if self.reminder.asked and status.waiting:
+            process.note(f"UAV {self.uav} waits; the mission waits for {status.waiting}")
+        self.reminder.asked = False
 
     # The radio.
 
@@ -210,6 +221,8 @@ class Service:
         elif isinstance(message, m.End):
             self._acknowledged(message.acknowledged)
             raise Left(process.DONE, message.reason)
+        elif isinstance(message, m.Status):
+            self._on_status(message)
         elif isinstance(message, m.Error):
             self._on_error(message)
         return None

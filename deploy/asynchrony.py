@@ -143,7 +143,7 @@ def fly(trial: Trial, team: int, hold: float, base: Mapping[str, Any], policy: b
     folder.mkdir(parents=True)
     road_map = folder.absolute() / "corners.txt"
     try:
-        road_map.write_text(raster(team, apart=trial.apart))
+        road_map.write_text(raster(team, apart=trial.apart), "utf-8")
         config, held_back = config_of(trial, team, hold, base, road_map)
         check(config, policy)
     except BaseException:  # nothing was flown: nothing is left

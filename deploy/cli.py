@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import importlib.util
 import os
@@ -81,6 +82,12 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt(number)
 
 
+def discard_output() -> None:
+    """Send to nowhere what is left of the output, or the interpreter fails once more when it writes that at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def check_install() -> None:
     """The four packages have plain names: make sure that they are ours, side by side in one folder."""
     origins = [(importlib.util.find_spec(name), name) for name in ("actors", "learner", "tmc", "deploy")]
@@ -94,8 +101,10 @@ def check_install() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    process.standard_streams()
+    process.inherited_signals()
     # While modules are imported nothing is worth an orderly end: Ctrl-C ends the process, without a traceback.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    process.handle(signal.SIGINT, signal.SIG_DFL)
     argv = sys.argv[1:] if argv is None else argv
     chosen = next((a for a in argv if not a.startswith("-")), None)
     args = parser_for(chosen).parse_args(argv)
@@ -103,26 +112,28 @@ def main(argv: list[str] | None = None) -> int:
 
     def run() -> int:
         check_install()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, interrupt)
-        return int(module.main(args))
+        for number in process.ENDING:
+            process.handle(number, interrupt)
+        code = int(module.main(args))
+        sys.stdout.flush()  # what cannot be written shows here, and not when the interpreter ends
+        return code
 
     try:
         return process.run(run, mistakes())
     except KeyboardInterrupt as stopped:
         return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
     except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough; we are not done, though
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_output()
         return 128 + signal.SIGPIPE
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in LEARNERS_OWN:
             raise
         mend = "in the folder of Overfly, run pip install '.[learner]'"
-        print(f"overfly: {error.name} is not installed, and a learner needs it: {mend}", file=sys.stderr)
+        process.tell(f"{error.name} is not installed, and a learner needs it: {mend}")
         return process.USAGE
     except OSError as error:  # a full disk, a folder that was removed
-        print(f"overfly: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
+        discard_output()
+        process.tell(f"{error.filename or 'output'}: {error.strerror or error}")
         return process.FAILED
 
 

@@ -72,11 +72,22 @@ class ForkServer:
 
     def _fork(self, name: str, argv: list[str], log: str) -> None:
         server = os.getpid()
-        pid = os.fork()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            self._refuse(name, log, f"the system has no room for another process ({error.strerror}): raise ulimit -u")
+            return
         if pid == 0:
             become(self._package, self._main, server, self._ends, argv, log)
         self._pids[name], self._names[pid] = pid, name
         _say({"name": name, "pid": pid})
+
+    @staticmethod
+    def _refuse(name: str, log: str, text: str) -> None:
+        """Report a process that could not be started, with the reason as its output."""
+        with contextlib.suppress(OSError), Path(log).open("a", encoding="utf-8") as output:
+            output.write(f"{process.ERROR}{text}\n")
+        _say({"name": name, "code": process.FAILED})
 
     def _reap(self) -> None:
         while self._names:
@@ -100,6 +111,7 @@ def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: l
     try:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.setsid()  # Ctrl-C in the terminal is for the supervisor, who ends all in order
         output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         for old, new in ((os.open(os.devnull, os.O_RDONLY), 0), (output, 1), (output, 2)):
@@ -111,8 +123,9 @@ def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: l
         code = main(argv)
     except SystemExit as left:  # argparse
         code = left.code if isinstance(left.code, int) else process.FAILED
-    except BaseException:  # the traceback belongs into the log, and nothing may get back into the server's loop
+    except BaseException as error:  # the traceback belongs into the log, and nothing may get back into the loop
         traceback.print_exc()
+        process.tell(f"{type(error).__name__}: {error}")
     finally:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(Exception):
@@ -127,12 +140,25 @@ def set_title(words: tuple[str, ...]) -> None:
     """
     if sys.platform != "linux":
         return
-    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    fields = Path("/proc/self/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
     start, end = int(fields[45]), int(fields[46])
     text = b"\0".join(word.encode() for word in words)[: max(end - start - 1, 0)]
     if start and text:
         ctypes.memset(start, 0, end - start)
         ctypes.memmove(start, text, len(text))
+
+
+def _do_without(a: argparse.Namespace) -> None:
+    """Start over without what is preloaded, since it started threads: a fork does not take them along.
+
+    The process, its pipes and the orders that wait in them stay. Where the package itself starts threads, there is
+    nothing to leave out, and the forks go ahead: what a thread held then is lost to them.
+    """
+    process.note(f"{process.threads()} threads run after importing {', '.join([a.of, *a.preload])}")
+    if a.preload:
+        process.note("each process imports for itself what would have been preloaded")
+        line = [sys.executable, "-P", "-m", "deploy.forkserver", f"--of={a.of}", f"--out={a.out}"]
+        os.execv(sys.executable, [*line, f"--parent={a.parent}", f"--room={a.room}"])
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -144,11 +170,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     parser.add_argument("--room", default="", help="space for the command lines of the processes")
     a = parser.parse_args(argv)
-    process.die_with_parent(a.parent)
+    process.become_child(a.parent)
     set_title((*TITLE, "deploy.forkserver", "--of", a.of, "--out", a.out, "--parent", str(a.parent)))
     program = importlib.import_module(f"{a.of}.__main__")
     for module in a.preload:
         importlib.import_module(module)
+    if process.threads() > 1:
+        _do_without(a)
     gc.collect()
     gc.freeze()  # what is here now is never collected, so a collection in a process does not copy its pages
     with contextlib.suppress(BrokenPipeError):

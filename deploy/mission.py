@@ -92,7 +92,7 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
         text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
-        print(f"overfly: {text}, and `overfly log recover` says what else is in it", file=sys.stderr)
+        process.tell(f"{text}, and `overfly log recover` says what else is in it")
     file = flown_policy(out)
     policy = file.read_bytes() if file.exists() else None
     world = check(config, policy)
@@ -126,7 +126,7 @@ def finished(out: Path) -> bool:
 def _told(out: Path) -> dict[str, Any]:
     """What `run.json` says; nothing where it is gone or broken."""
     try:
-        told = json.loads((out / "run.json").read_text())
+        told = json.loads((out / "run.json").read_text("utf-8"))
     except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
@@ -148,6 +148,7 @@ class Mission:
 
     def run(self, *, in_one_process: bool) -> int:
         """Fly it; returns the exit code. What it left is in the run folder either way."""
+        code, said = process.DONE, ""
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
@@ -156,15 +157,16 @@ class Mission:
                 self._fly()
             self._seal()
         except MissionFailed as failed:
-            self.progress.note(str(failed))
-            return process.FAILED
+            code, said = process.FAILED, str(failed)
         except KeyboardInterrupt as stopped:
-            self.progress.note(f"stopped; what was flown is in {self.out}")
-            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+            code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+            said = f"stopped; what was flown is in {self.out}"
         finally:
+            self._write_run(self._ended)  # first of all: what is said goes to a terminal that may be gone
             self.progress.clear()
-            self._write_run(self._ended)
-        return process.DONE
+        if said:
+            self.progress.note(said)
+        return code
 
     def _fly(self) -> None:
         mission = plan.make(self.config, self.out, policy=self.policy)
@@ -206,7 +208,7 @@ class Mission:
             "seconds": round(time.time() - self._start, 1),
         }
         try:
-            (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
+            disk.put(self.out / "run.json", (json.dumps(facts | more, indent=1) + "\n").encode(), sync=False)
         except OSError as error:
             self.progress.note(f"cannot write {self.out / 'run.json'}: {error.strerror}")
 

@@ -31,7 +31,7 @@ def read_preset(name: str) -> tuple[dict[str, Any], str]:
     """The settings of a preset as dotted keys, those of its base first, and its one-line description."""
     if name not in preset_names():
         raise ConfigError(f"there is no preset '{name}': choose {', '.join(preset_names())}")
-    table = tomllib.loads(files("deploy").joinpath("presets", f"{name}.toml").read_text())
+    table = tomllib.loads(files("deploy").joinpath("presets", f"{name}.toml").read_text("utf-8"))
     about, base = table.pop("about"), table.pop("base", None)
     values = read_preset(base)[0] if base else {}
     return values | _dotted(table), about

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
+import os
 import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from deploy import plan as plans
 from deploy.forked import ForkServer, Handle, forkserver_command
+from deploy.suspension import Suspension
 from tmc.wire import process
 
 BACKOFF = (0.1, 5.0)
@@ -36,8 +38,8 @@ FINAL = {process.USAGE, process.FENCED}
 """Exit codes after which a process is not started again."""
 
 
-class MissionFailed(Exception):  # noqa: N818  the sentence for the user
-    """A process failed for good: which one, how, and where its output is."""
+class MissionFailed(process.FailedError):
+    """A process failed and is not started again: which one, how, and where its output is."""
 
 
 @dataclass
@@ -58,11 +60,14 @@ class Supervisor:
     def __init__(self, plan: plans.Plan, out: Path, threads: int, say: Callable[[str], None]) -> None:
         self.plan, self.out, self.threads, self.say = plan, out, threads, say
         self.running = [_Running(child) for child in plan.children]
+        self._suspension: Suspension | None = None
+        self._adopts = process.adopts_orphans()
         self._forkservers = {name: self._forkserver(name) for name in {c.fork_of for c in plan.children} - {""}}
 
     def start(self) -> None:
-        """Start everybody."""
+        """Start all processes."""
         (self.out / "logs").mkdir(exist_ok=True)
+        self._suspension = Suspension(lambda: self.pids().values())
         for running in self.running:
             self._start(running)
 
@@ -82,11 +87,17 @@ class Supervisor:
     def _start(self, running: _Running) -> None:
         child, log = running.child, self.log_of(running.child.name)
         running.started = time.monotonic()
-        if child.fork_of:
-            running.handle = self._forkservers[child.fork_of].start(child.name, child.command, log)
-            return
+        try:
+            if child.fork_of:
+                running.handle = self._forkservers[child.fork_of].start(child.name, child.command, log)
+            else:
+                running.handle = self._spawn(child, log)
+        except OSError as error:
+            raise MissionFailed(f"{child.name} cannot be started: {error.strerror or error}") from None
+
+    def _spawn(self, child: plans.Child, log: Path) -> Handle:
         with log.open("ab") as output:
-            running.handle = subprocess.Popen(
+            return subprocess.Popen(
                 child.command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
@@ -97,6 +108,9 @@ class Supervisor:
 
     def watch(self) -> bool:
         """Look after the processes once; True when the mission is over. Raises MissionFailed."""
+        if self._suspension is not None:
+            self._suspension.take()
+        self._reap_orphans()
         for running in self.running:
             if running.handle is None:
                 if time.monotonic() >= running.again_at:
@@ -113,6 +127,16 @@ class Supervisor:
                     self._again(running, "left before the TMC was back", BACKOFF[0])
         return False
 
+    def _reap_orphans(self) -> None:
+        """Collect the processes of a forkserver that was killed, where they become zombies of this process."""
+        if not self._adopts:
+            return
+        ours = {server.pid for server in self._forkservers.values()}
+        ours |= {r.handle.pid for r in self.running if isinstance(r.handle, subprocess.Popen)}
+        with suppress(ChildProcessError):
+            while (ended := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)) and ended.si_pid not in ours:
+                os.waitpid(ended.si_pid, 0)
+
     def _left_a_former_life(self, running: _Running) -> bool:
         """Whether it was sent home by a life of the TMC that is over: the next one may need it all the same."""
         lead = next((r for r in self.running if r.child.leads and r.handle is not None), None)
@@ -125,13 +149,14 @@ class Supervisor:
         child, up = running.child, time.monotonic() - running.started
         crashed = code not in OUTSIDE
         running.crashes = crashed + (0 if up > STEADY else running.crashes)
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        how = process.how_it_ended(code)
         log = self.log_of(child.name)
+        reason = self._reason(child)
         if crashed and shutil.disk_usage(self.out).free < FULL:  # then its own sentence found no room either
             mend = f"free some space, and go on with `overfly run --resume {self.out}`"
             raise MissionFailed(f"{child.name} {how}: the disk that holds {self.out} is full; {mend}")
         if not child.restart or code in FINAL or running.crashes >= TRIES:
-            raise MissionFailed(f"{child.name} {how}{self._reason(log)}; its output is in {log}")
+            raise MissionFailed(f"{child.name} {how}{reason}; its output is in {log}")
         delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1]) if crashed else BACKOFF[0]
         self._again(running, how, delay)
 
@@ -141,11 +166,14 @@ class Supervisor:
         running.restarts += 1
         self.say(f"{running.child.name} {how}; it is started again (log: {self.log_of(running.child.name)})")
 
-    @staticmethod
-    def _reason(log: Path) -> str:
-        """The last line that a process left, when it is one of our sentences."""
-        lines = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
-        return f": {lines[-1].removeprefix('overfly: ')[:300]}" if lines and lines[-1].startswith("overfly:") else ""
+    def _reason(self, child: plans.Child) -> str:
+        """The error that a process left as its last line, or that of the forkserver which could not start it."""
+        for name in (child.name, f"forkserver-{child.fork_of}"):
+            log = self.log_of(name)
+            text = process.last_error(log.read_text("utf-8", errors="replace")) if log.exists() else ""
+            if text:
+                return f": {text[:300]}"
+        return ""
 
     def stop(self) -> None:
         """Ask everybody to leave; the TMC last, so that nothing is shipped in vain. Kill who does not."""
@@ -186,9 +214,12 @@ class Supervisor:
 
     def close(self) -> None:
         """End the forkservers, and remove what the processes shared."""
+        if self._suspension is not None:
+            self._suspension.close()
         for server in self._forkservers.values():
             server.close()
-        with contextlib.suppress(OSError):
+        self._reap_orphans()
+        with suppress(OSError):
             shutil.rmtree(self.plan.scratch)
         if self.plan.held is not None:
             self.plan.held.close()

@@ -43,7 +43,7 @@ def _of_run(folder: Path) -> Who:
     if not config.is_file():
         raise ConfigError(f"{folder} is no run folder: it has no config.json")
     try:
-        values = dict(flat(build(json.loads(config.read_text()))))
+        values = dict(flat(build(json.loads(config.read_text("utf-8")))))
     except (AttributeError, TypeError, ValueError) as error:
         raise ConfigError(f"{config} cannot be read: {error}") from None
     if values.get("team.pilot", "policy") != "policy":

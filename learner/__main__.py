@@ -28,7 +28,7 @@ def learn(endpoint: str, out: Path) -> int:
     try:
         return process.DONE if service.learn(stop) else stop.code
     except ReplacedError as error:
-        print(f"overfly: {error}", file=sys.stderr)
+        process.tell(str(error))
         return process.FENCED
     finally:
         service.close()
@@ -41,8 +41,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="run folder")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args(argv)
-    process.die_with_parent(a.parent)
-    return process.run(lambda: learn(a.connect, a.out), MISTAKES)
+    process.become_child(a.parent)
+    return process.run_child(lambda: learn(a.connect, a.out), MISTAKES)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from tmc.kernel.config import Config, build
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.policy import view_shape
 from tmc.kernel.world import World
+from tmc.wire import process
 
 WARM = 10
 """Updates before time is taken."""
@@ -132,8 +133,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser("learner.bare", description=__doc__)
     parser.add_argument("--config", type=Path, required=True, help="settings as JSON, dotted keys")
     parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args(argv)
-    print(rate(build(json.loads(a.config.read_text())), a.seconds))
+    process.become_child(a.parent)
+    print(rate(build(json.loads(a.config.read_text("utf-8"))), a.seconds))
     return 0
 
 

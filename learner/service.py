@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,7 @@ from tmc.kernel.world import World
 from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
-from tmc.wire import sockets
+from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
 from tmc.wire.sockets import EndpointError
 
@@ -32,8 +31,6 @@ SILENCE = 1.0
 """Seconds without a minibatch after which the learner says hello again: the TMC may have been started anew."""
 METRICS_EVERY = 0.2
 """Seconds between two metrics messages in the log."""
-TELL_EVERY = 5.0
-"""Seconds between two lines that say that no TMC answers."""
 
 
 class ReplacedError(Exception):
@@ -49,6 +46,7 @@ class Service:
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, sockets.feed_endpoint(endpoint), "learner")
         self.log: LogWriter | None = None
+        self.reminder = process.Reminder()
         self._request, self._flying = 0, set[int]()
         """The number of the last request for a minibatch, and the requests in flight."""
         self._hailed = False
@@ -75,6 +73,7 @@ class Service:
         self._ask()
         over = False
         while not over and not stop():
+            self._remind()
             for message in self._listen():
                 over |= self._obey(message)
         self._finish()
@@ -82,11 +81,9 @@ class Service:
 
     def _join(self, saved: Saved | None, stop: Callable[[], bool]) -> m.Welcome | m.End | None:
         """Say hello until the TMC answers; None when stopped before."""
-        told = time.monotonic()
         while not stop():
-            if time.monotonic() - told > TELL_EVERY:
-                told = time.monotonic()
-                print(f"overfly: the learner waits for a TMC at {self.endpoint}", file=sys.stderr, flush=True)
+            if self.reminder.due():
+                process.note(f"the learner waits for a TMC at {self.endpoint}")
             sockets.send(self.sock, m.Hello("learner", -1, self.life, saved.meta.updates if saved else 0))
             if self.sock.poll(1000):
                 message = self._receive()
@@ -117,10 +114,10 @@ class Service:
     def _own(self, run: str) -> None:
         """Refuse a folder with the checkpoints of another mission: the learner would go on from them."""
         mark = self.out / "learner.run"
-        if mark.exists() and not run.startswith(mark.read_text().strip()):  # a power cut may leave half of it
+        if mark.exists() and not run.startswith(mark.read_text("utf-8").strip()):  # a power cut may leave half of it
             raise EndpointError(f"{self.out} holds what was learned in another mission: choose another --out")
         self.out.mkdir(parents=True, exist_ok=True)
-        mark.write_text(run + "\n")
+        mark.write_text(run + "\n", "utf-8")
 
     def _listen(self) -> list[m.Message]:
         """What has come in; the time spent waiting for it is the learner's idle time."""
@@ -131,6 +128,19 @@ class Service:
         self._idle += time.monotonic() - since
         message = self._receive()
         return [] if message is None else [message]
+
+    def _remind(self) -> None:
+        """Ask the TMC for what the mission waits, where there was nothing to learn for some seconds, and tell."""
+        if self.reminder.due(self.trainer.updates):
+            if self.reminder.asked:
+                process.note(f"the learner waits for an answer of the TMC at {self.endpoint}")
+            self.reminder.asked = True
+            sockets.send(self.sock, m.StatusRequest())
+
+    def _on_status(self, status: m.Status) -> None:
+        if self.reminder.asked and status.waiting:
+            process.note(f"the learner waits; the mission waits for {status.waiting}")
+        self.reminder.asked = False
 
     def _receive(self) -> m.Message | None:
         try:
@@ -159,6 +169,8 @@ class Service:
                 self._flying.clear()
                 self._push()
                 self._ask()
+        elif isinstance(message, m.Status):
+            self._on_status(message)
         elif isinstance(message, m.Error):
             self._say("error", f"the TMC says: {message.text}")
             if message.code == "fenced" and message.life == self.life:

@@ -82,13 +82,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--resume", action="store_true", help="go on with the journal in the run folder")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args(argv)
-    process.die_with_parent(a.parent)
+    process.become_child(a.parent)
 
     def start() -> int:
-        config = build(json.loads(a.config.read_text()))
+        config = build(json.loads(a.config.read_text("utf-8")))
         return serve(config, a.bind, a.out, policy=a.policy, tracks=a.tracks, resume=a.resume)
 
-    return process.run(start, MISTAKES)
+    return process.run_child(start, MISTAKES)
 
 
 if __name__ == "__main__":

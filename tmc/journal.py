@@ -80,7 +80,7 @@ class Journal:
             path = self.folder / "oaths" / "tmc.txt"
             path.parent.mkdir(exist_ok=True)
             now = self.writer.active.stat()
-            with path.open("a") as file:
+            with path.open("a", encoding="utf-8") as file:
                 file.write(f"{now.st_ino} {now.st_size}\n")
 
     def keep_policies(self, held: Mapping[int, bytes]) -> None:

@@ -14,9 +14,9 @@ from tmc import roster
 from tmc.journal import Journal
 from tmc.roster import LEARNER, uav_name
 from tmc.station import Station
-from tmc.wire import sockets
+from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError, decode
-from tmc.wire.messages import Begin, Bye, End, Lost, Map, Message, PolicyPush
+from tmc.wire.messages import Begin, Bye, End, Lost, Map, Message, PolicyPush, Welcome
 
 BURST = 64
 """Messages taken from one socket before the other has its turn."""
@@ -67,6 +67,7 @@ class Service:
         """Up to when UAVs must have been answered before a newer policy is taken."""
         self._waiting: PolicyPush | None = None
         self._ticked = time.monotonic()
+        self._reminder = process.Reminder()
         self._unsettled: float | None = None
         """When the oldest entry came that is not journalled, seconds of the monotonic clock."""
 
@@ -82,6 +83,7 @@ class Service:
             self._take_waiting()
             self._send()
             self._settle()
+            self._remind()
             self.journal.writer.maybe_flush()
             if self._finished():
                 self._sum_up()
@@ -97,6 +99,18 @@ class Service:
             roster.excuse(self.station.roster, now - then, now)
         self._ticked = now
         self.station.tick(now)
+
+    def _remind(self) -> None:
+        """Say for what the mission waits, where it has not gone on for some seconds."""
+        station = self.station
+        if self._reminder.due((station.phase, station.ticks, station.limiter.updates)) and (text := self._waits_for()):
+            process.note(text)
+
+    def _waits_for(self) -> str:
+        if self._over is not None and self._here:
+            return f"the mission is over; the TMC waits for {roster.name_some(sorted(self._here))} to leave"
+        missing = roster.name_some(self.station.waiting_for())
+        return f"the TMC waits for {missing}" if missing else ""
 
     def _patience(self) -> int:
         """Milliseconds to wait for a message; not so long that a silence would be seen late."""
@@ -153,8 +167,6 @@ class Service:
         except CodecError as error:
             self.station.reject(sender, error.code, str(error))
             return
-        self._here.add(sender)
-        self._expected.discard(sender)
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
@@ -203,6 +215,9 @@ class Service:
             # Who was not heard yet may have been connected to an earlier life of this process.
             sock, identity = self._where.get(name) or (self.feed if name == LEARNER else self.sync, name.encode())
             sockets.send(sock, message, identity)
+            if isinstance(message, Welcome):  # one that was refused is not waited for
+                self._here.add(name)
+                self._expected.discard(name)
 
     def _secure(self, sends: list[tuple[str, Message]]) -> None:
         """Commit first what must not be lost once these are sent: see `binds`, and that a UAV was told to fly another
@@ -228,8 +243,7 @@ class Service:
             return False
         now = time.monotonic()
         self._over = self._over or now
-        members = any(name == LEARNER or name.startswith("uav-") for name in self._here)
-        return now - self._over >= max(FAREWELL * members, REUNION * bool(self._expected))
+        return now - self._over >= max(FAREWELL * bool(self._here), REUNION * bool(self._expected))
 
     def _say_goodbye(self, reason: str) -> None:
         for sock, identity in self._where.values():

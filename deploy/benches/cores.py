@@ -6,15 +6,17 @@ and that changes from minute to minute: a figure of processes that share the wor
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
-import subprocess
 import sys
 import time
 
 import numpy as np
 
+from deploy import helper
 from deploy.benches.row import core_count
+from tmc.wire import process
 
 SECONDS, AHEAD = 0.25, 1.0
 """How long is counted, alone and then together; and the time that processes get to start."""
@@ -26,12 +28,11 @@ def worth() -> float | None:
     """The products of all cores at once over those of one; None where a process was not there in time."""
     start = time.monotonic() + AHEAD
     env = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    command = [sys.executable, "-P", "-m", "deploy.benches.cores", str(start)]
     children = [
-        subprocess.Popen([*command, str(int(alone))], env=env, stdout=subprocess.PIPE, text=True)
+        helper.start("deploy.benches.cores", start, int(alone), env=env)
         for alone in (True, *(False,) * (core_count() - 1))
     ]
-    counts: list[list[int] | None] = [json.loads(child.communicate()[0]) for child in children]
+    counts: list[list[int] | None] = [json.loads(helper.output_of(child)) for child in children]
     there = [count for count in counts if count is not None]
     if len(there) < len(counts):
         return None
@@ -50,7 +51,13 @@ def products(until: float) -> int:
 
 def main(argv: list[str]) -> int:
     """A process that counts: [products alone, products together] as JSON, null when it came too late."""
-    start, first = float(argv[0]), argv[1] == "1"
+    parser = argparse.ArgumentParser("deploy.benches.cores", description=__doc__)
+    parser.add_argument("start", type=float, help="seconds of the monotonic clock")
+    parser.add_argument("first", type=int, help="1: counts alone first")
+    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    a = parser.parse_args(argv)
+    process.become_child(a.parent)
+    start, first = a.start, a.first == 1
     products(time.monotonic() + 0.05)
     if time.monotonic() > start:
         print("null")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,7 +19,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
-from deploy import plan, settings
+from deploy import helper, plan, settings
 from deploy.benches.replay import fill
 from deploy.benches.rollout import started, weigh_all
 from deploy.benches.row import Row
@@ -117,11 +116,10 @@ def bare_loop(config: Config, seconds: float, name: str) -> float:
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         file.write(json.dumps(flat(config)))
         file.flush()
-        command = [sys.executable, "-P", "-m", "learner.bare", "--config", file.name, "--seconds", str(seconds)]
         env = plan.environment(name, config.training.threads)
         env |= {"OMP_WAIT_POLICY": "PASSIVE"} if name == "learner" else {}
-        done = subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE, text=True)
-    return float(done.stdout)
+        words = ("learner.bare", "--config", file.name, "--seconds", seconds)
+        return float(helper.output_of(helper.start(*words, env=env)))
 
 
 def fly(world: World, seconds: float, out: Path) -> Learned:
@@ -159,7 +157,7 @@ def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
     """Seconds of the processor so far, by role: learner, TMC, and all UAVs together."""
     spent = dict.fromkeys(("learner", "tmc", "uavs"), 0.0)
     for name, pid in pids.items():
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
         role = next((role for role in ("tmc", "learner") if name.endswith(role)), "uavs")  # with what forks them
         spent[role] += (int(fields[11]) + int(fields[12])) / TICK
     return spent

@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy import plan, settings
+from deploy import helper, plan, settings
 from deploy.benches.row import Row
 from deploy.mission import check
 from tmc.kernel.config import ConfigError, build, flat
@@ -31,6 +30,7 @@ from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Floats, Observer
 from tmc.kernel.world import World
 from tmc.replay import Replay, Ring
+from tmc.wire import process
 
 LIMITS = {"bytes": 100.0, "memory": 60.0, "minibatch": 1.5, "inserts": 100_000.0, "prioritised": 3.0}
 """What is asked of 100,000 transitions of the paper: bytes each, MB in all, ms a minibatch, at least inserts/s, ms a
@@ -52,15 +52,13 @@ def measure(args: argparse.Namespace) -> list[Row]:
     if args.minibatches < 1:
         raise ConfigError("--minibatches must be 1 or more")
     world = check(settings.config_for("paper", settings.chosen(args)))
-    command = [sys.executable, "-P", "-m", "deploy.benches.replay", "--minibatches", str(args.minibatches)]
+    words = ("deploy.benches.replay", "--minibatches", args.minibatches)
     told = json.dumps(flat(world.config))
-    done = subprocess.run(
-        command, input=told, env=plan.environment("tmc", 1), stdout=subprocess.PIPE, text=True, check=True
-    )  # fmt: skip
+    printed = helper.output_of(helper.start(*words, env=plan.environment("tmc", 1)), told)
     held, batch, found = (
         f"{world.config.replay.capacity:,} transitions",
         world.config.dqn.batch,
-        json.loads(done.stdout),
+        json.loads(printed),
     )
     return [
         _row(held, found["bytes"], "bytes each", "bytes"),
@@ -174,7 +172,10 @@ def main() -> int:
     """The process that is measured: settings as JSON on stdin, figures as JSON on stdout."""
     parser = argparse.ArgumentParser("deploy.benches.replay", description=__doc__)
     parser.add_argument("--minibatches", type=int, required=True)
-    json.dump(weigh(json.load(sys.stdin), parser.parse_args().minibatches), sys.stdout)
+    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    a = parser.parse_args()
+    process.become_child(a.parent)
+    json.dump(weigh(json.load(sys.stdin), a.minibatches), sys.stdout)
     return 0
 
 

@@ -162,7 +162,7 @@ def started(
     config: Config, policy: bytes | None, out: Path, *, table: bool = True
 ) -> Iterator[tuple[Supervisor, Observer]]:
     """The processes of a mission in `out`, and who asks how far they are; they are stopped with the block."""
-    (out / "config.json").write_text(json.dumps(flat(config)))
+    (out / "config.json").write_text(json.dumps(flat(config)), "utf-8")
     file = None if policy is None else out / "flown.onnx"
     if file is not None and policy is not None:
         file.write_bytes(policy)
@@ -206,7 +206,7 @@ def own() -> float | None:
 
 def _rollup(pid: int) -> dict[str, int]:
     """KiB by kind, from /proc/PID/smaps_rollup."""
-    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text("utf-8", "replace")
     return {name: int(size) for name, size in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
 
 

@@ -74,7 +74,7 @@ def _oaths(out: Path) -> Iterable[tuple[Number, str]]:
     """((uav, sequence), digest) of each line."""
     for path in oath_files(out):
         uav = int(path.stem.removeprefix("uav-"))
-        for line in path.read_text().splitlines():
+        for line in path.read_text("utf-8").splitlines():
             sequence, digest = line.split()
             yield (uav, int(sequence)), digest
 
@@ -96,7 +96,7 @@ class Snapshot:
         os.link(_journal(out), link)
         sworn = {}
         for path in oath_files(out):
-            lines = path.read_text().splitlines()
+            lines = path.read_text("utf-8").splitlines()
             if lines:
                 sworn[int(path.stem.removeprefix("uav-"))] = int(lines[-1].split()[0])
         return cls(link, sworn)

@@ -38,5 +38,5 @@ def synced(out: Path, journal: Path) -> int:
     now, told = journal.stat(), out / "oaths" / "tmc.txt"
     if not told.exists():
         return now.st_size // 2
-    inode, size = told.read_text().split("\n")[-2].split()
+    inode, size = told.read_text("utf-8").split("\n")[-2].split()
     return int(size) if int(inode) == now.st_ino else now.st_size

@@ -116,7 +116,7 @@ class Storm:
 
     def write(self, text: str) -> None:
         """A line of the diary."""
-        with self._diary.open("a") as file:
+        with self._diary.open("a", encoding="utf-8") as file:
             file.write(f"{time.monotonic() - self._start:8.2f} {text}\n")
 
     def show(self) -> None:

@@ -9,13 +9,11 @@ import os
 import sys
 import time
 from collections.abc import Collection, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from statistics import mean, stdev
 from typing import Any
 
-from deploy import lockstep, settings, who
+from deploy import lockstep, pool, settings, who
 from deploy.mission import bound_of, check
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.world import World
@@ -147,8 +145,7 @@ def fly_all(work: list[tuple[str, Config, bytes | None]], jobs: int) -> list[Fli
     """Fly all missions on `jobs` processes, with progress."""
     if jobs == 1 or len(work) == 1:
         return list(_progress(map(fly_one, work), len(work)))
-    with ProcessPoolExecutor(min(jobs, len(work)), get_context("spawn")) as pool:
-        return list(_progress(pool.map(fly_one, work), len(work)))
+    return list(_progress(pool.call_each(fly_one, work, jobs), len(work)))
 
 
 def _progress(flights: Iterable[Flight], total: int) -> Iterator[Flight]:

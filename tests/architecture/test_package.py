@@ -70,7 +70,7 @@ def test_the_wheel_carries_licence_and_command(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         info = {Path(name).name: name for name in archive.namelist() if ".dist-info/" in name}
         assert "Apache License" in archive.read(info["LICENSE"]).decode()
-        assert "overfly = deploy.cli:main" in archive.read(info["entry_points.txt"]).decode()
+        assert "overfly = deploy.entry:main" in archive.read(info["entry_points.txt"]).decode()
 
 
 def test_the_installed_command_runs_from_an_empty_folder(installed: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from deploy import supervisor as supervisors
-from deploy.forked import Forked, ForkServer
+from deploy.forked import Forked, ForkServer, forkserver_command
 from deploy.plan import Child, Plan, make
 from deploy.supervisor import MissionFailed, Supervisor
 from tmc.kernel.config import build
@@ -266,3 +266,66 @@ def test_what_a_killed_supervisor_left_in_memory_is_removed_by_the_next(tmp_path
     finally:
         living.held.close()
         shutil.rmtree(living.scratch)
+
+
+def threads_of(pid: int) -> int:
+    return len(list(Path(f"/proc/{pid}/task").iterdir()))
+
+
+def test_processes_are_forked_from_one_that_has_no_threads(tmp_path: Path) -> None:
+    """A fork takes no threads along. What is preloaded starts none with the versions that are installed."""
+    plan = make(build({"team.size": 1}), tmp_path, policy=None)
+    supervisor = Supervisor(plan, tmp_path, 1, lambda _: None)
+    supervisor.start()
+    try:
+        watch_until(supervisor, lambda: {"uav-000", "learner"} <= set(supervisor.pids()), 60.0)
+        pids = supervisor.pids()
+        assert {name: threads_of(pids[name]) for name in ("forkserver-actors", "forkserver-learner")} == {
+            "forkserver-actors": 1,
+            "forkserver-learner": 1,
+        }
+        assert plan.preload == {"actors": ("actors.policy",)}
+    finally:
+        supervisor.stop()
+        supervisor.close()
+
+
+def test_a_preloaded_module_that_starts_a_thread_is_left_out(tmp_path: Path) -> None:
+    """As a later version of a library may: the forkserver starts over without it, under the same process id."""
+    (tmp_path / "threaded.py").write_text(
+        "import threading, time\nthreading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+    )
+    line = forkserver_command("actors", tmp_path, ["threaded"], 200)
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+    server = ForkServer(line, environment, tmp_path / "forkserver.txt")
+    command = ("--id", "0", "--connect", f"ipc://{tmp_path}/nobody", "--out", str(tmp_path))
+    child = server.start("uav-000", command, tmp_path / "uav-000.txt")
+    try:
+        until = time.monotonic() + 60
+        while child.pid is None:
+            assert child.poll() is None and time.monotonic() < until
+            time.sleep(0.01)
+        assert server.pid is not None and threads_of(server.pid) == 1
+        assert "2 threads run after importing actors, threaded" in (tmp_path / "forkserver.txt").read_text()
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.wait(10.0)
+        server.close()
+
+
+def test_the_reason_of_a_crash_is_repeated_and_a_note_is_not(supervise, monkeypatch) -> None:
+    monkeypatch.setattr(supervisors, "TRIES", 1)
+    text = (
+        "from tmc.wire.process import note, run_child\n"
+        "def main():\n    note('it waits for something')\n    return 1 // 0\n"
+        "raise SystemExit(run_child(main, ()))"
+    )
+    supervisor = supervise(python("tmc", text, leads=True))
+    with pytest.raises(MissionFailed, match=r"tmc ended with exit code 1: ZeroDivisionError: .*; its output is in"):
+        watch_until(supervisor, lambda: False)
+    assert "Traceback" in supervisor.log_of("tmc").read_text()
+
+
+def test_a_program_that_cannot_be_started_is_one_sentence(supervise, tmp_path: Path) -> None:
+    with pytest.raises(MissionFailed, match="tmc cannot be started: No such file"):
+        supervise(Child("tmc", (str(tmp_path / "none"),), restart=True, leads=True))

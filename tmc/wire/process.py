@@ -1,4 +1,4 @@
-"""What every process does around its main loop: note signals, die with its parent, end with a code that tells."""
+"""What every process does around its main loop: take over from its parent, note signals, end with a code that tells."""
 
 from __future__ import annotations
 
@@ -6,23 +6,113 @@ import ctypes
 import os
 import signal
 import sys
+import threading
+import time
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from types import FrameType
+from typing import Any
 
 DONE, FAILED, USAGE, FENCED, STOPPED = 0, 1, 2, 75, 143
 """Exit codes: all well; failed; a user's mistake; replaced by a newer process of the same name; ended by a signal."""
 
-_PR_SET_PDEATHSIG = 1
+ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""Signals that end a process in order."""
+ERROR, NOTE = "overfly: ", "overfly: note: "
+"""What a line on stderr begins with: an error, and what only tells how things are."""
+REPEAT_S = 5.0
+"""Time after which a process that waits says so, and says it again."""
+
+_PR_SET_PDEATHSIG, _PR_GET_CHILD_SUBREAPER = 1, 37
+
+
+class FailedError(Exception):
+    """The work failed though the command was right: one sentence for the user, exit code 1."""
+
+
+def tell(text: str, prefix: str = ERROR) -> None:
+    """Print a line on stderr. Never raises: a stderr that is closed, full or gone must not fail the work."""
+    with suppress(OSError, ValueError):
+        print(f"{prefix}{text}", file=sys.stderr, flush=True)
+
+
+def note(text: str) -> None:
+    """Print a line on stderr that is not an error."""
+    tell(text, NOTE)
+
+
+class Reminder:
+    """Says every `REPEAT_S` seconds what a process waits for, as long as its work stands still."""
+
+    def __init__(self) -> None:
+        self._since, self._at = time.monotonic(), None
+        self.asked = False
+        """True from a question to its answer, where another process knows what is waited for."""
+
+    def due(self, at: Any = None) -> bool:
+        """True every `REPEAT_S` seconds, once each, while `at`, which tells how far the work is, stays the same."""
+        now = time.monotonic()
+        if at != self._at:
+            self._since, self._at, self.asked = now, at, False
+        due = now - self._since >= REPEAT_S
+        if due:
+            self._since = now
+        return due
+
+
+def standard_streams() -> None:
+    """Make stdin, stdout and stderr usable whatever the parent did to them.
+
+    A closed one is opened on /dev/null, or the next file to be opened would take its place. A character that the
+    locale's encoding lacks is written as an escape sequence instead of raising UnicodeEncodeError.
+    """
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDONLY if number == 0 else os.O_WRONLY)  # takes the lowest number that is free
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:  # Python found it closed
+            stream = open(number, "w", encoding="utf-8", closefd=False)  # noqa: SIM115  open as long as the process
+            setattr(sys, name, stream)
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def inherited_signals() -> None:
+    """Look at the signal state that the parent left.
+
+    Respected: HUP and INT that it ignores (nohup; a background job of a script), and TERM; children of this process get
+    TERM back, since their supervisor ends them by it. Reset: a blocked mask, and CHLD, without which the end of a child
+    is lost.
+    """
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:
+        signal.signal(signal.SIGTERM, _ignore)  # unlike SIG_IGN, a handler does not outlive an exec
+
+
+def _ignore(_number: int, _frame: FrameType | None) -> None:
+    """Do nothing."""
+
+
+def handle(number: int, handler: Callable[[int, FrameType | None], Any] | signal.Handlers) -> None:
+    """Install a signal handler, unless the parent has the signal ignored."""
+    if signal.getsignal(number) not in {signal.SIG_IGN, _ignore}:
+        signal.signal(number, handler)
 
 
 class Stop:
-    """True once SIGTERM or SIGINT came; a second signal ends the process at once."""
+    """True once SIGTERM, SIGINT or SIGHUP came; a second signal ends the process at once."""
 
     def __init__(self) -> None:
         self.asked, self.code = False, STOPPED
         """Whether to stop, and the exit code of a process that did: 128 + the signal's number."""
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, self._note)
+        for number in ENDING:
+            handle(number, self._note)
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         if self.asked:
@@ -31,6 +121,16 @@ class Stop:
 
     def __call__(self) -> bool:
         return self.asked
+
+
+def become_child(parent: int) -> None:
+    """Prepare a process that `parent` started: its streams, its signals, and that it dies with its parent.
+
+    `parent` is 0 for a process that was started by hand.
+    """
+    standard_streams()
+    inherited_signals()
+    die_with_parent(parent)
 
 
 def die_with_parent(parent: int) -> None:
@@ -44,9 +144,57 @@ def die_with_parent(parent: int) -> None:
 
 
 def run(main: Callable[[], int], mistakes: tuple[type[Exception], ...]) -> int:
-    """Run `main`; a user's mistake becomes one sentence on stderr and exit code 2, never a traceback."""
+    """Run `main`; a user's mistake or a failure becomes one sentence on stderr and exit code 2 or 1, no traceback."""
     try:
         return main()
+    except FailedError as error:
+        tell(str(error))
+        return FAILED
     except mistakes as error:
-        print(f"overfly: {error}", file=sys.stderr)
+        tell(str(error))
         return USAGE
+
+
+def run_child(main: Callable[[], int], mistakes: tuple[type[Exception], ...]) -> int:
+    """Run `main` as `run` does, in a process whose supervisor reads its output.
+
+    An error that is not a user's mistake leaves its traceback there, and as the last line the sentence that the
+    supervisor repeats.
+    """
+    try:
+        return run(main, mistakes)
+    except Exception as error:
+        traceback.print_exc()
+        tell(f"{type(error).__name__}: {error}")
+        return FAILED
+
+
+def how_it_ended(code: int) -> str:
+    """How a process ended, by its exit code, or minus the number of the signal that killed it."""
+    if code >= 0:
+        return f"ended with exit code {code}"
+    return f"was killed by {signal.Signals(-code).name}"
+
+
+def last_error(output: str) -> str:
+    """The last error that a process printed, without its prefix; empty when its last line is not one of ours."""
+    lines = [line for line in output.strip().splitlines() if not line.startswith(NOTE)]
+    return lines[-1].removeprefix(ERROR) if lines and lines[-1].startswith(ERROR) else ""
+
+
+def adopts_orphans() -> bool:
+    """True where a process whose parent was killed becomes a child of this one: in a container, or a subreaper."""
+    if os.getpid() == 1:
+        return True
+    flag = ctypes.c_int(0)
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_GET_CHILD_SUBREAPER, ctypes.byref(flag))
+    return bool(flag.value)
+
+
+def threads() -> int:
+    """Threads of this process, those that libraries started included, where the system tells."""
+    try:
+        return sum(1 for _ in Path("/proc/self/task").iterdir())
+    except OSError:
+        return threading.active_count()

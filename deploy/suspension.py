@@ -1,0 +1,50 @@
+"""Ctrl-Z: the processes of a mission stop with the command that looks after them, and go on with it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from types import FrameType
+
+from tmc.wire import process
+
+
+class Suspension:
+    """Takes note of SIGTSTP, which a terminal sends for Ctrl-Z; respected where the parent has it ignored.
+
+    `pids`: the processes to stop and to let go on, in the order in which they go on.
+    """
+
+    def __init__(self, pids: Callable[[], Iterable[int]]) -> None:
+        self._pids, self._asked = pids, False
+        self._before = signal.getsignal(signal.SIGTSTP)
+        process.handle(signal.SIGTSTP, self._note)
+
+    def _note(self, _number: int, _frame: FrameType | None) -> None:
+        self._asked = True
+
+    def take(self) -> None:
+        """Stop all of them and this process, if that was asked for; returns when the shell has them go on."""
+        if not self._asked:
+            return
+        self._asked = False
+        pids = [*self._pids()]
+        _send(reversed(pids), signal.SIGSTOP)
+        try:
+            signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+            os.kill(os.getpid(), signal.SIGTSTP)  # the system ignores it where no shell could have it go on
+            signal.signal(signal.SIGTSTP, self._note)
+        finally:
+            _send(pids, signal.SIGCONT)
+
+    def close(self) -> None:
+        """Leave the signal as it was found."""
+        signal.signal(signal.SIGTSTP, self._before)
+
+
+def _send(pids: Iterable[int], number: signal.Signals) -> None:
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
