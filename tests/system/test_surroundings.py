@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import pty
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,29 @@ LONG = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60000", "--episode
 PATIENCE_S = 90.0
 
 
-def start(folder: Path, *args: object, before: Callable[[], Any] | None = None, **more: Any) -> subprocess.Popen[str]:
-    """`overfly ARGS`; `before` is called in the new process, as what its parent did to it."""
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Starts `overfly ARGS`, and ends what a test that failed has left.
+
+    `before` is called in the new process, as what its parent did to it; `line`: another command than `overfly`.
+    """
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*args: object, before: Callable[[], Any] | None = None, **more: Any) -> subprocess.Popen[str]:
+        started.append(popen(tmp_path, *args, before=before, **more))
+        return started[-1]
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+def popen(folder: Path, *args: object, before: Callable[[], Any] | None, **more: Any) -> subprocess.Popen[str]:
     more = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **more}
     return subprocess.Popen([*LINE, *map(str, args)], cwd=folder, errors="replace", preexec_fn=before, **more)  # noqa: PLW1509  no threads
 
@@ -55,10 +76,10 @@ def flies(out: Path) -> bool:
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
-def test_a_signal_that_the_parent_ignores_ends_nothing(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_signal_that_the_parent_ignores_ends_nothing(start, tmp_path: Path, number: signal.Signals) -> None:
     """nohup, a script's background job; and the processes of the mission still end in order at its end."""
     out = tmp_path / "R"
-    run = start(tmp_path, *FLY, "--ticks", 1500, "--out", out, before=ignore(number))
+    run = start(*FLY, "--ticks", 1500, "--out", out, before=ignore(number))
     until(lambda: flies(out), "the flight")
     run.send_signal(number)
     _, errors = run.communicate(timeout=PATIENCE_S)
@@ -68,9 +89,9 @@ def test_a_signal_that_the_parent_ignores_ends_nothing(tmp_path: Path, number: s
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
 @pytest.mark.parametrize("command", [("evaluate", "planner:greedy", "--seeds", "40", "--jobs", "2"), ("tmc",)])
-def test_every_command_respects_it(tmp_path: Path, command: tuple[str, ...], number: signal.Signals) -> None:
+def test_every_command_respects_it(start, tmp_path: Path, command: tuple[str, ...], number: signal.Signals) -> None:
     bind = ("--bind", f"ipc://{tmp_path}/s", "--out", tmp_path / "R") if command == ("tmc",) else ()
-    run = start(tmp_path, *command, *bind, before=ignore(number))
+    run = start(*command, *bind, before=ignore(number))
     until(lambda: caught(run.pid, signal.SIGTERM), "handlers")
     run.send_signal(number)
     run.send_signal(number)
@@ -87,33 +108,33 @@ def caught(pid: int, number: int) -> bool:
     return bool(int(next(line.split()[1] for line in lines if line.startswith("SigCgt:")), 16) >> (number - 1) & 1)
 
 
-def test_a_parent_that_ignores_the_end_of_its_children(tmp_path: Path) -> None:
+def test_a_parent_that_ignores_the_end_of_its_children(start, tmp_path: Path) -> None:
     """With SIGCHLD ignored, the system forgets how a child ended."""
     out = tmp_path / "R"
-    run = start(tmp_path, *FLY, "--out", out, before=ignore(signal.SIGCHLD))
+    run = start(*FLY, "--out", out, before=ignore(signal.SIGCHLD))
     _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     told = json.loads((out / "run.json").read_text())
     assert told["exit_codes"] == {"tmc": 0, "uav-000": 0, "uav-001": 0} and told["restarts"] == {}
 
 
-def test_a_mask_that_the_parent_left_is_taken_off(tmp_path: Path) -> None:
+def test_a_mask_that_the_parent_left_is_taken_off(start, tmp_path: Path) -> None:
     def block() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD, signal.SIGHUP, signal.SIGINT})
 
     out = tmp_path / "R"
-    run = start(tmp_path, *LONG, "--out", out, before=block)
+    run = start(*LONG, "--out", out, before=block)
     until(lambda: flies(out), "the flight")
     run.send_signal(signal.SIGTERM)
     _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 143, errors
 
 
-def test_a_terminal_that_closes_ends_the_mission_in_order(tmp_path: Path) -> None:
+def test_a_terminal_that_closes_ends_the_mission_in_order(start, tmp_path: Path) -> None:
     """SIGHUP, and then no sentence can be written any more; how each process ended is on the disk all the same."""
     out = tmp_path / "R"
     ours, its = pty.openpty()
-    run = start(tmp_path, *LONG, "--out", out, stdin=its, stdout=its, stderr=its, start_new_session=True)
+    run = start(*LONG, "--out", out, stdin=its, stdout=its, stderr=its, start_new_session=True)
     os.close(its)
     until(lambda: flies(out), "the flight")
     os.close(ours)
@@ -123,10 +144,10 @@ def test_a_terminal_that_closes_ends_the_mission_in_order(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("stream", [1, 2])
-def test_a_closed_stream_does_not_fail_the_work(tmp_path: Path, stream: int) -> None:
+def test_a_closed_stream_does_not_fail_the_work(start, tmp_path: Path, stream: int) -> None:
     out = tmp_path / "R"
     given = {1: "stdout", 2: "stderr"}[stream]
-    run = start(tmp_path, *FLY, "--out", out, before=lambda: os.close(stream), **{given: None})
+    run = start(*FLY, "--out", out, before=lambda: os.close(stream), **{given: None})
     printed, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert set(json.loads((out / "run.json").read_text())["exit_codes"].values()) == {0}
@@ -134,17 +155,17 @@ def test_a_closed_stream_does_not_fail_the_work(tmp_path: Path, stream: int) -> 
 
 
 @pytest.mark.parametrize("mission", [FLY, ("evaluate", "planner:greedy", "--seeds", "2", "--ticks", "50")])
-def test_a_full_stderr_does_not_fail_the_work(tmp_path: Path, mission: tuple[str, ...]) -> None:
+def test_a_full_stderr_does_not_fail_the_work(start, tmp_path: Path, mission: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w") as full:
-        run = start(tmp_path, *mission, stderr=full)
+        run = start(*mission, stderr=full)
         printed, _ = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0 and "ncertainty" in printed
 
 
-def test_a_full_stdout_is_one_sentence_after_the_work(tmp_path: Path) -> None:
+def test_a_full_stdout_is_one_sentence_after_the_work(start, tmp_path: Path) -> None:
     out = tmp_path / "R"
     with Path("/dev/full").open("w") as full:
-        run = start(tmp_path, *FLY, "--out", out, stdout=full)
+        run = start(*FLY, "--out", out, stdout=full)
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1
     assert errors.endswith("overfly: output: No space left on device\n") and "Traceback" not in errors
@@ -157,18 +178,18 @@ def test_a_full_stdout_is_one_sentence_after_the_work(tmp_path: Path) -> None:
     ids=lambda command: command[0],
 )
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_a_locale_that_lacks_characters(tmp_path: Path, command: tuple[str, ...], encoding: str) -> None:
+def test_a_locale_that_lacks_characters(start, tmp_path: Path, command: tuple[str, ...], encoding: str) -> None:
     env = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": encoding}
-    run = start(tmp_path, *command, env=env)
+    run = start(*command, env=env)
     printed, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert "Traceback" not in errors and printed
 
 
-def test_files_are_read_and_written_in_utf_8_whatever_the_locale(tmp_path: Path) -> None:
+def test_files_are_read_and_written_in_utf_8_whatever_the_locale(start, tmp_path: Path) -> None:
     """Python warns, when asked to, wherever a file is opened in the encoding of the locale."""
     env = os.environ | {"PYTHONWARNDEFAULTENCODING": "1", "PYTHONWARNINGS": "error::EncodingWarning"}
-    run = start(tmp_path, *FLY, "--ticks", "20", "--out", tmp_path / "R", env=env)
+    run = start(*FLY, "--ticks", "20", "--out", tmp_path / "R", env=env)
     _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors + "".join(p.read_text() for p in (tmp_path / "R" / "logs").iterdir())
 
@@ -179,16 +200,16 @@ SHADOWS = ("types", "signal", "multiprocessing", "numpy", "tmc", "random", "stru
 @pytest.mark.parametrize(
     "command", [("evaluate", "planner:greedy", "--seeds", "3", "--ticks", "20", "--jobs", "2"), FLY], ids=lambda c: c[0]
 )
-def test_nothing_is_imported_from_the_current_folder(tmp_path: Path, command: tuple[str, ...]) -> None:
+def test_nothing_is_imported_from_the_current_folder(start, tmp_path: Path, command: tuple[str, ...]) -> None:
     for name in SHADOWS:
         (tmp_path / f"{name}.py").write_text("raise SystemExit('imported from the current folder')\n")
-    run = start(tmp_path, *command)
+    run = start(*command)
     _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
 
 
-def test_an_evaluation_whose_worker_is_killed_says_so(running, tmp_path: Path) -> None:
-    run = start(tmp_path, "evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2")
+def test_an_evaluation_whose_worker_is_killed_says_so(start, running, tmp_path: Path) -> None:
+    run = start("evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2")
     marker = f"--parent={run.pid}"
     until(lambda: len(running(marker)) == 2, "two workers")
     os.kill(running(marker)[0], signal.SIGKILL)
@@ -200,8 +221,8 @@ def test_an_evaluation_whose_worker_is_killed_says_so(running, tmp_path: Path) -
     assert "Traceback" not in errors and running(marker) == []
 
 
-def test_workers_die_with_an_evaluation_that_is_killed(running, tmp_path: Path) -> None:
-    run = start(tmp_path, "evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2")
+def test_workers_die_with_an_evaluation_that_is_killed(start, running, tmp_path: Path) -> None:
+    run = start("evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2")
     marker = f"--parent={run.pid}"
     until(lambda: len(running(marker)) == 2, "two workers")
     run.kill()
@@ -210,10 +231,10 @@ def test_workers_die_with_an_evaluation_that_is_killed(running, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.3, 0.8])
-def test_ctrl_c_early_leaves_no_traceback(running, tmp_path: Path, delay: float) -> None:
+def test_ctrl_c_early_leaves_no_traceback(start, running, tmp_path: Path, delay: float) -> None:
     """In the whole group, as a terminal sends it."""
     command = ("evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2")
-    run = start(tmp_path, *command, start_new_session=True)
+    run = start(*command, start_new_session=True)
     until(lambda: caught(run.pid, signal.SIGINT), "the start of Python, which prints a traceback of its own before it")
     until(lambda: not caught(run.pid, signal.SIGINT), "the start of the command")
     time.sleep(delay)
@@ -223,9 +244,9 @@ def test_ctrl_c_early_leaves_no_traceback(running, tmp_path: Path, delay: float)
     until(lambda: running(f"--parent={run.pid}") == [], "no workers")
 
 
-def test_ctrl_z_stops_the_mission_and_fg_lets_it_go_on(here, running, tmp_path: Path) -> None:
+def test_ctrl_z_stops_the_mission_and_fg_lets_it_go_on(start, here, running, tmp_path: Path) -> None:
     out, mission = tmp_path / "R", (*FLY, "--ticks", 3000, "--seed", 5)
-    run = start(tmp_path, *mission, "--out", out, process_group=0)
+    run = start(*mission, "--out", out, process_group=0)
     until(lambda: flies(out), "the flight")
     run.send_signal(signal.SIGTSTP)
     until(lambda: state(run.pid) in {"T", "Z"}, "the supervisor's stop")
@@ -239,17 +260,13 @@ def test_ctrl_z_stops_the_mission_and_fg_lets_it_go_on(here, running, tmp_path: 
     assert digest(out) == digest(tmp_path / "L")
 
 
-ADOPTS = """
-import ctypes, os, subprocess, sys
-ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: the place of process 1 in a container
-os.execv(sys.argv[1], sys.argv[1:])
-"""
+PR_SET_CHILD_SUBREAPER = 36
+"""Gives a process the place that process 1 has in a container."""
 
 
-def test_the_first_process_of_a_container_reaps_what_a_killed_forkserver_leaves(running, tmp_path: Path) -> None:
+def test_the_first_process_of_a_container_reaps_what_a_killed_forkserver_leaves(start, running, tmp_path: Path) -> None:
     out = tmp_path / "R"
-    command = [sys.executable, "-P", "-c", ADOPTS, *LINE, *LONG, "--out", str(out)]
-    run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = start(*LONG, "--out", out, before=lambda: ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1))
 
     def uavs() -> bool:
         return len(set(running("actors --id")) & set(running(str(out)))) == 2
@@ -279,10 +296,10 @@ def zombies(parent: int) -> list[int]:
     return found
 
 
-def test_who_waits_for_whom_is_said_on_both_sides(tmp_path: Path) -> None:
+def test_who_waits_for_whom_is_said_on_both_sides(start, tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/s"
-    tmc = start(tmp_path, "tmc", "--fly", "planner:greedy", "--actors", 2, "--bind", endpoint, "--out", tmp_path / "R")
-    uav = start(tmp_path, "actor", "--id", 0, "--connect", endpoint, "--out", tmp_path / "U")
+    tmc = start("tmc", "--fly", "planner:greedy", "--actors", 2, "--bind", endpoint, "--out", tmp_path / "R")
+    uav = start("actor", "--id", 0, "--connect", endpoint, "--out", tmp_path / "U")
     try:
         for process, line in (
             (tmc, "note: the TMC waits for uav-001"),
@@ -297,14 +314,14 @@ def test_who_waits_for_whom_is_said_on_both_sides(tmp_path: Path) -> None:
             process.communicate(timeout=PATIENCE_S)
 
 
-def test_a_learner_that_was_refused_holds_nobody_back(tmp_path: Path) -> None:
+def test_a_learner_that_was_refused_holds_nobody_back(start, tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/s"
-    tmc = start(tmp_path, "tmc", "--fly", "planner:greedy", "--actors", 1, "--ticks", 50, "--bind", endpoint,
+    tmc = start("tmc", "--fly", "planner:greedy", "--actors", 1, "--ticks", 50, "--bind", endpoint,
                 "--out", tmp_path / "R")  # fmt: skip
-    learner = start(tmp_path, "learner", "--connect", endpoint, "--out", tmp_path / "L")
+    learner = start("learner", "--connect", endpoint, "--out", tmp_path / "L")
     _, errors = learner.communicate(timeout=PATIENCE_S)
     assert learner.returncode == 2 and "the TMC refused" in errors
-    uav = start(tmp_path, "actor", "--id", 0, "--connect", endpoint, "--out", tmp_path / "U")
+    uav = start("actor", "--id", 0, "--connect", endpoint, "--out", tmp_path / "U")
     assert uav.wait(PATIENCE_S) == 0
     over = time.monotonic()
     uav.communicate()
