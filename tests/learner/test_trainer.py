@@ -325,12 +325,16 @@ def test_weights_count_as_in_the_plain_equations(preset, trainer_of, minibatch_o
     assert ((found - uneven).abs() > bound).any(), "the bound tells nothing apart"
 
 
-def test_weights_of_one_give_the_same_weights_of_the_network(paper, trainer_of, minibatch_of):
+def test_weights_of_one_count_as_none(paper, trainer_of, minibatch_of):
     plain, weighted = trainer_of(paper), trainer_of(paper)
     for number in range(3):
         batch = minibatch_of(paper, number, b=16)
-        assert plain.update(batch) == weighted.update(replace(batch, weight=np.ones(16, "<f4")))
-    assert same(plain, weighted)
+        weighted.load(plain.state())
+        exact, bound = rounding.gradient(paper, plain.online, plain.target, batch)
+        losses = plain.update(batch).loss, weighted.update(replace(batch, weight=np.ones(16, "<f4"))).loss
+        assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+        for trainer in (plain, weighted):
+            assert ((bare.gradient(trainer.online).double() - exact).abs() <= bound).all()
 
 
 def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatch_of):
