@@ -12,14 +12,15 @@ import json
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from learner import dqn, qnet
+from learner import dqn, qnet, rounding
 from learner.intake import Batch
-from learner.trainer import Trainer, channels_last, copy_due
+from learner.trainer import Trainer, copy_due
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.policy import view_shape
@@ -65,11 +66,13 @@ class Bare:
 
 
 class Tensors:
-    """A minibatch as tensors; `layout` (torch's memory format): how its images lie in memory."""
+    """A minibatch as tensors."""
 
-    def __init__(self, batch: Batch, layout: torch.memory_format = torch.contiguous_format) -> None:
-        images = (batch.observation, batch.next_observation(np.arange(len(batch.action))))
-        self.o, self.o_next = (torch.tensor(image).contiguous(memory_format=layout) for image in images)
+    def __init__(self, batch: Batch) -> None:
+        self.o, self.o_next = (
+            torch.tensor(batch.observation),
+            torch.tensor(batch.next_observation(np.arange(len(batch.action)))),
+        )
         self.action, self.allowed = torch.tensor(batch.action).long(), torch.tensor(batch.allowed)
         self.reward, self.discount = torch.tensor(batch.reward), torch.tensor(batch.discount)
 
@@ -96,31 +99,41 @@ def rate(config: Config, seconds: float) -> float:
     return (bare.updates - WARM) / (time.perf_counter() - start)
 
 
-def departures(config: Config, batches: Iterable[Batch]) -> tuple[float, float]:
-    """How far the trainer's gradients are from the bare loop's, relative to their length: the largest of all updates.
+@dataclass(frozen=True)
+class Departures:
+    """How far gradients of float32 are from the exact ones: the largest of all updates.
 
-    Before each update the bare loop gets the trainer's theta (its theta- follows by itself): left alone, the two drift
-    apart by rounding that every step enlarges, and a mistake would hide in that. Second, the same of a bare loop whose
-    images lie in memory as the trainer's do: sums in another order, so float32's rounding and nothing else.
-
-    On one thread, since the order of sums would otherwise depend on their number.
+    `learner`, `textbook`: the trainer's and the bare loop's, relative to the gradient's length. `of_bound`: the
+    trainer's, in any one weight, relative to the most that rounding can do there (`learner.rounding`). Above 1, the
+    trainer computes something else.
     """
-    torch.set_num_threads(1)
+
+    learner: float
+    textbook: float
+    of_bound: float
+
+
+def departures(config: Config, batches: Iterable[Batch]) -> Departures:
+    """Compare the trainer's gradient of each update with the exact one, and the bare loop's with that too.
+
+    Before each update the bare loop gets the trainer's theta, and the exact gradient is taken there; theta- follows by
+    itself. Left alone, two loops drift apart by rounding that every step enlarges, and a mistake would hide in that.
+    """
+    torch.set_num_threads(1)  # as `trainer.start` does
     grid = World(config).grid
     shape = view_shape(config, grid)
-    trainer, bare, turned = Trainer(config, shape, grid), Bare(config, shape), Bare(config, shape)
-    channels_last(turned.online), channels_last(turned.target)
-    ours = rounding = 0.0
+    trainer, bare = Trainer(config, shape, grid), Bare(config, shape)
+    found = [torch.zeros(3, dtype=torch.float64)]
     for batch in batches:
-        for loop, layout in ((bare, torch.contiguous_format), (turned, torch.channels_last)):
-            loop.online.load_state_dict(trainer.online.state_dict())
-            loop.follow(batch.episodes)
-            loop.update(Tensors(batch, layout))
+        bare.online.load_state_dict(trainer.online.state_dict())
+        bare.follow(batch.episodes)
+        exact, bound = rounding.gradient(config, bare.online, bare.target, batch)
+        bare.update(Tensors(batch))
         trainer.update(batch)
-        true = gradient(bare.online)
-        ours = max(ours, float((gradient(trainer.online) - true).norm() / true.norm()))
-        rounding = max(rounding, float((gradient(turned.online) - true).norm() / true.norm()))
-    return ours, rounding
+        mine, plain = (gradient(net).double() - exact for net in (trainer.online, bare.online))
+        length = exact.norm().clamp_min(torch.finfo(torch.float32).tiny)
+        found.append(torch.stack((mine.norm() / length, plain.norm() / length, (mine.abs() / bound).max())))
+    return Departures(*torch.stack(found).amax(0).tolist())  # NaN stays NaN
 
 
 def gradient(net: qnet.QNet) -> torch.Tensor:

@@ -8,22 +8,36 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tests.command import overfly
 
-settings.register_profile("overfly", deadline=None, derandomize=True)
-settings.register_profile("explore", deadline=None, derandomize=False)
+PATIENT = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("overfly", derandomize=True, **PATIENT)
+settings.register_profile("explore", derandomize=False, **PATIENT)
 settings.load_profile("overfly")
+
+for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "PYTHONWARNINGS"):
+    os.environ.pop(name, None)  # what the user's terminal and other programs are to do is no setting of the tests
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 TRAINED = ("run", "quick", "--ticks", 60, "--episodes", 2, "--no-pictures",
            *(word for change in ("replay.learn_start=60", "dqn.batch=16", "journal.flush=0.1", "trial.witness=true")
              for word in ("--set", change)))  # fmt: skip
+
+
+@pytest.fixture
+def short() -> Iterator[Path]:
+    """A folder with room for the name of a socket: the system takes 107 bytes in all, and `tmp_path` may be longer."""
+    folders = {tempfile.gettempdir(), "/tmp", "/dev/shm"}
+    folder = min((f for f in folders if os.access(f, os.W_OK)), key=lambda f: len(os.fsencode(f)))
+    with tempfile.TemporaryDirectory(prefix="ofly-", dir=folder) as name:
+        yield Path(name)
 
 
 @pytest.fixture(scope="session")

@@ -177,9 +177,12 @@ def compare(world: World, steps: int) -> Iterator[Row]:
 
     replay = Replay(world, observation.Observer(world))
     fill(replay)
-    ours, rounding = bare.departures(world.config, _batches(replay, steps))
-    ratio = ours / rounding if rounding else None
-    yield Row("learner", f"{steps:,} steps", ours, "of the gradient", rounding, ratio, "x rounding alone")
+    found, case = bare.departures(world.config, _batches(replay, steps)), f"{steps:,} steps"
+    ratio = found.learner / found.textbook if found.textbook else None
+    yield Row("learner", case, found.learner, "of the gradient", found.textbook, ratio, "x bare loop's rounding")
+    yield Row(
+        "learner", f"{case}, worst weight", found.of_bound, "of the bound", 1.0, found.of_bound, "x float32's bound"
+    )
 
 
 def _batches(replay: Replay, count: int) -> Iterator[Batch]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 from dataclasses import dataclass
@@ -24,6 +25,11 @@ class Row:
     reference: float | None = None
     ratio: float | None = None
     what: str = ""
+
+
+def finite(x: Any) -> Any:
+    """None for a float that is not a number or not finite: JSON has no word for it, a table no use."""
+    return None if isinstance(x, float) and not math.isfinite(x) else x
 
 
 def core_count() -> int:
@@ -64,13 +70,13 @@ def text(rows: list[Row]) -> str:
     lines = [f"{'case':<34} {'value':>12} {'unit':<22} {'reference':>12} {'ratio':>6}"]
     lines += [
         f"{r.case:<34} {_number(r.value):>12} {r.unit:<22} {_number(r.reference):>12} "
-        f"{'' if r.ratio is None else f'{r.ratio:.2f}':>6} {r.what}".rstrip()
+        f"{'' if finite(r.ratio) is None else f'{r.ratio:.2f}':>6} {r.what}".rstrip()
         for r in rows
     ]
     return "\n".join(lines)
 
 
 def _number(x: float | None) -> str:
-    if x is None:
+    if x is None or not math.isfinite(x):
         return "-"
     return f"{x:,.0f}" if abs(x) >= 1000 else f"{x:.4g}"

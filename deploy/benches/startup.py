@@ -149,7 +149,7 @@ def _first_update(log: Path) -> int | None:
 
 def first_word(out: Path) -> float:
     """Seconds from the start of `overfly actor` to its Hello at a TMC, which is this process here."""
-    endpoint = f"ipc://{out}/sync"
+    endpoint = f"tcp://127.0.0.1:{sockets.free_port()}"  # the name of a folder may be too long for a socket
     context: zmq.Context[Any] = zmq.Context()
     try:
         tmc = sockets.router(context, endpoint)

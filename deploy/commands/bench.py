@@ -9,7 +9,7 @@ import sys
 from dataclasses import asdict, dataclass
 
 from deploy.benches import cores
-from deploy.benches.row import machine, text
+from deploy.benches.row import finite, machine, text
 from deploy.supervisor import MissionFailed
 from tmc.wire.process import FAILED
 
@@ -59,7 +59,7 @@ def main(args: argparse.Namespace) -> int:
     facts["cores_worth"] = [before, cores.worth()]
     if args.json:
         for row in rows:
-            print(json.dumps(asdict(row) | facts))
+            print(json.dumps({key: finite(value) for key, value in asdict(row).items()} | facts))
         return 0
     print(text(rows))
     print("\n" + " · ".join(f"{key} {value}" for key, value in facts.items()), file=sys.stderr)

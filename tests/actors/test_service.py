@@ -15,6 +15,7 @@ import pytest
 import zmq
 
 from actors.service import Left, Service, another_mission
+from tests.command import PATIENCE
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
 from tmc.record.writer import LogWriter
@@ -23,30 +24,30 @@ from tmc.wire import process, sockets
 from tmc.wire.codec import decode
 
 
-def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path) -> None:
-    endpoint, context = f"ipc://{tmp_path}/sync", zmq.Context[Any]()
+def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path, short: Path) -> None:
+    endpoint, context = f"ipc://{short}/sync", zmq.Context[Any]()
     tmc, service = sockets.router(context, endpoint), Service(0, endpoint, tmp_path / "R")
     try:
         with ThreadPoolExecutor(1) as other:
             joining = other.submit(service._join, lambda: False)
-            assert tmc.poll(20_000)
+            assert tmc.poll(1000 * PATIENCE)
             frames = sockets.receive(tmc)
             assert frames is not None
             sockets.send(tmc, m.End("the mission is over"), bytes(frames[0]))
             with pytest.raises(Left, match="over") as left:
-                joining.result(20)
+                joining.result(PATIENCE)
             assert left.value.code == process.DONE
     finally:
         service.close()
         context.destroy(linger=0)
 
 
-def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path: Path) -> None:
+def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path: Path, short: Path) -> None:
     """UAV 0 waits for UAV 1, of which nothing comes, while beacons of UAV 2 come in all the time."""
     world = World(build({"team.size": 3, "team.pilot": "planner:greedy", "training.ticks": 100}))
     numbered = ((e, world.starts(e)) for e in range(1, 5000))
     episode, starts = next((e, s) for e, s in numbered if world.grid.chebyshev(s[0], s[1]) <= 2)
-    endpoint, context = f"ipc://{tmp_path}/sync", zmq.Context[Any]()
+    endpoint, context = f"ipc://{short}/sync", zmq.Context[Any]()
     tmc, service, over = sockets.router(context, endpoint), Service(0, endpoint, tmp_path / "R"), threading.Event()
     zeros = np.zeros(world.law.cells.size, "<u2")
     welcome = m.Welcome(json.dumps(flat(world.config)), world.map.fingerprint, "run", "", 0, 0)
@@ -55,7 +56,7 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
     said: Counter[str] = Counter()
     try:
         with ThreadPoolExecutor(1) as other:
-            flying, until = other.submit(service.fly, over.is_set), time.monotonic() + 20.0
+            flying, until = other.submit(service.fly, over.is_set), time.monotonic() + PATIENCE
             while (said["ask"] < 5 or said["Alive"] < 2) and time.monotonic() < until:
                 if said["Hello"]:
                     sockets.send(tmc, beacon, b"uav-000")
@@ -72,7 +73,7 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
                     sockets.send(tmc, m.Map(episode, 0, 1, 0, 0, 0, zeros, m.EMPTY), bytes(identity))
             over.set()
             with pytest.raises(Left):
-                flying.result(20)
+                flying.result(PATIENCE)
         assert said["ask"] >= 5 and said["Alive"] >= 2, said
     finally:
         service.close()

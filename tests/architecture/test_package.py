@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import PATIENCE
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"actors", "learner", "tmc", "deploy"}
 
@@ -20,7 +22,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     code = f"from hatchling.build import build_wheel; print(build_wheel({str(folder)!r}))"
     result = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-P", "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert result.returncode == 0, result.stderr
     return folder / result.stdout.split()[-1]
@@ -45,7 +47,9 @@ def overfly(installed: Path, where: Path, *args: str) -> subprocess.CompletedPro
     """Run the installed command from another folder; its packages come first, before an editable install's."""
     environment = os.environ | {"PYTHONPATH": str(installed)}
     command = [sys.executable, "-P", "-m", "deploy.cli", *args]
-    return subprocess.run(command, cwd=where, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        command, cwd=where, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
 
 
 def test_the_wheel_holds_the_four_packages_and_no_tests(contents: set[str]) -> None:
@@ -90,9 +94,9 @@ def test_the_installed_command_flies(installed: Path, tmp_path: Path) -> None:
 
 
 def test_the_packages_come_from_the_wheel(installed: Path, tmp_path: Path) -> None:
-    code = "import actors, learner, tmc, deploy; print(*{p.__path__[0] for p in (actors, learner, tmc, deploy)})"
+    code = "import actors, learner, tmc, deploy\nfor p in (actors, learner, tmc, deploy): print(p.__path__[0])"
     result = subprocess.run(
         [sys.executable, "-P", "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)},
-        capture_output=True, text=True, timeout=60, check=True,
+        capture_output=True, text=True, timeout=PATIENCE, check=True,
     )  # fmt: skip
-    assert {Path(p).parent for p in result.stdout.split()} == {installed}
+    assert {Path(p).parent for p in result.stdout.splitlines()} == {installed}

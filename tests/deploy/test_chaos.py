@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import os
 import socket
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from deploy.chaos import wire
 from deploy.chaos.blows import CUT, KILL, POWER, STOP, blows, role
 from deploy.chaos.judge import Snapshot, judge
 from deploy.chaos.power import cut_tails
 from deploy.chaos.storm import Growth, Storm
 from deploy.chaos.wire import Forwarder
 from deploy.cli import main
+from tests.command import PATIENCE
 from tmc.kernel.config import Journal
 from tmc.record import builders
 from tmc.record.builders import record_digest
@@ -149,9 +150,9 @@ def test_a_journal_that_was_just_taken_over_was_synced_as_a_whole(tmp_path: Path
 
 
 @pytest.fixture
-def line(tmp_path: Path) -> Iterator[tuple[Forwarder, socket.socket, Path]]:
+def line(short: Path) -> Iterator[tuple[Forwarder, socket.socket, Path]]:
     """A forwarder, the listener behind it, and where it listens itself."""
-    front, back = (Path(os.path.relpath(tmp_path / name)) for name in ("front", "back"))
+    front, back = short / "front", short / "back"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(back))
         listener.listen()
@@ -162,13 +163,17 @@ def line(tmp_path: Path) -> Iterator[tuple[Forwarder, socket.socket, Path]]:
 
 def call(front: Path) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX)
-    sock.settimeout(10)
+    sock.settimeout(PATIENCE)
     sock.connect(str(front))
     return sock
 
 
-def test_bytes_pass_both_ways_until_they_are_cut_off(line: tuple[Forwarder, socket.socket, Path]) -> None:
+def test_bytes_pass_both_ways_until_they_are_cut_off(
+    line: tuple[Forwarder, socket.socket, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     forwarder, listener, front = line
+    now = [100.0]
+    monkeypatch.setattr(wire, "time", SimpleNamespace(monotonic=lambda: now[0]))
     with call(front) as client:
         server, _ = listener.accept()
         with server:
@@ -185,9 +190,9 @@ def test_bytes_pass_both_ways_until_they_are_cut_off(line: tuple[Forwarder, sock
             assert server.recv(1) == b"" and client.recv(1) == b""
     with call(front) as refused:
         assert refused.recv(1) == b""
-    time.sleep(0.3)
+    now[0] += 0.31
     with call(front) as again:
-        listener.settimeout(10)
+        listener.settimeout(PATIENCE)
         server, _ = listener.accept()
         again.sendall(b"here")
         assert server.recv(10) == b"here"

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.command import PATIENCE
+
 ROOT = Path(__file__).parents[2]
 CODE = """
 import hashlib, os
@@ -50,8 +52,9 @@ def test_a_forked_learner_computes_the_same_bit_for_bit_on_its_threads() -> None
     """First in the fork, then in the process that was forked from."""
     env = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, "-P", "-c", CODE], cwd=ROOT, env=env, capture_output=True, text=True, timeout=120, check=False
-    )
+        [sys.executable, "-P", "-c", CODE], cwd=ROOT, env=env,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     forked, started = done.stdout.split("\n")[:2]
     assert forked == started and forked.endswith("True")

@@ -8,9 +8,10 @@ import onnxruntime
 import pytest
 import torch
 
-from learner import bare, dqn, qnet
+from learner import bare, dqn, qnet, rounding
 from learner.intake import TrainingError
 from learner.trainer import Trainer, copy_due
+from tests.learner.claims import assert_exact_within_rounding, batches_with_repeats
 from tmc.kernel.config import build, flat
 from tmc.kernel.grid import Grid
 from tmc.kernel.policy import KEY, PolicyCard, card_for
@@ -32,36 +33,38 @@ def following(batch):
     return batch.next_observation(np.arange(len(batch.action)))
 
 
-def plain_updates(config, shape, batches):
-    """The weights after these minibatches: plain layout, Adam as Kingma and Ba give it, theta- never copied."""
-    net, target = qnet.build(config, shape), qnet.build(config, shape)
-    lr, (b1, b2), eps = config.dqn.learning_rate, (0.9, 0.999), 1e-8
-    m, v = ([torch.zeros_like(p) for p in net.parameters()] for _ in range(2))
-    for t, batch in enumerate(batches, start=1):
-        o, o_next, reward, discount, allowed = (
-            torch.tensor(x) for x in (batch.observation, following(batch), batch.reward, batch.discount, batch.allowed)
-        )
-        with torch.no_grad():
-            choice = net(o_next) if config.dqn.double else None
-            y = dqn.target(reward * config.dqn.reward_scale, discount, target(o_next), allowed, choice)
-        net.zero_grad()
-        dqn.loss(dqn.td_error(net(o), torch.tensor(batch.action, dtype=torch.int64), y), config.dqn.loss).backward()
-        with torch.no_grad():
-            for p, mean, square in zip(net.parameters(), m, v, strict=True):
-                mean.mul_(b1).add_((1 - b1) * p.grad)
-                square.mul_(b2).add_((1 - b2) * p.grad**2)
-                p.sub_(lr * (mean / (1 - b1**t)) / ((square / (1 - b2**t)).sqrt() + eps))
-    return net
+class PlainAdam:
+    """Adam as Kingma and Ba give it (Algorithm 1), in float64, from the weights of `net`."""
+
+    def __init__(self, net, lr):
+        self.theta, self.lr, self.t = weights(net).double(), lr, 0
+        self.m, self.v = torch.zeros_like(self.theta), torch.zeros_like(self.theta)
+
+    def step(self, g):
+        self.t += 1
+        b1, b2 = 0.9, 0.999
+        self.m, self.v = b1 * self.m + (1 - b1) * g, b2 * self.v + (1 - b2) * g**2
+        self.theta -= self.lr * (self.m / (1 - b1**self.t)) / ((self.v / (1 - b2**self.t)).sqrt() + 1e-8)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_updates_are_plain_adam_on_the_plain_equations(preset, trainer_of, minibatch_of, threads):
+    """The gradient is the exact one within rounding, and the weights are Adam's of that gradient.
+
+    One after the other, since Adam divides by the gradient's size: of a weight whose gradient is nothing but rounding
+    it makes a whole step, this way or that.
+    """
     trainer = trainer_of(build({**flat(preset), "training.threads": threads}))
-    batches = [minibatch_of(preset, n) for n in range(4)]
-    for batch in batches:
+    adam, eps = PlainAdam(trainer.online, preset.dqn.learning_rate), torch.finfo(torch.float32).eps
+    for n in range(4):
+        batch = minibatch_of(preset, n)
+        exact, bound = rounding.gradient(preset, trainer.online, trainer.target, batch)
         trainer.update(batch)
-    plain = plain_updates(preset, trainer.shape, batches)
-    torch.testing.assert_close(weights(trainer.online), weights(plain), atol=2e-5, rtol=0)
+        found = bare.gradient(trainer.online).double()
+        assert ((found - exact).abs() <= bound).all()
+        adam.step(found)
+    # Each step rounds the weight, and some ten numbers that are no larger than the step.
+    torch.testing.assert_close(weights(trainer.online).double(), adam.theta, atol=40 * eps * adam.lr, rtol=4 * eps)
     assert not torch.allclose(weights(trainer.online), weights(trainer.target), atol=1e-4)
 
 
@@ -248,22 +251,11 @@ def test_metrics_are_plain_floats(small, trainer_of, minibatch_of):
     assert all(type(v) is float and math.isfinite(v) for k, v in vars(metrics).items() if k != "updates")
 
 
-def batches_with_repeats(minibatch_of, config, count, **fields):
-    """Minibatches in which most transitions come back, in other company, as those of a memory do."""
-    pool, rng = minibatch_of(config, 77, b=24, **fields), np.random.Generator(np.random.Philox(5))
-    names = [name for name, value in vars(pool).items() if isinstance(value, np.ndarray) and value.size]
-    for number in range(count):
-        rows = rng.integers(0, 24, 16)
-        again = {name: getattr(pool, name)[rows] for name in names}
-        yield minibatch_of(config, number, b=16, **again, next_observation=pool.next_observation(rows))
-
-
 @pytest.mark.parametrize("double", [False, True])
 def test_values_that_are_kept_change_nothing(small, trainer_of, minibatch_of, double):
-    """Against the bare loop, which computes every value every time; theta- follows in between."""
+    """The gradients are those that have every value computed every time; theta- follows in between."""
     config = small({"dqn.target_episodes": 0, "dqn.target_updates": 10, "dqn.double": double})
-    ours, rounding = bare.departures(config, batches_with_repeats(minibatch_of, config, 60))
-    assert 0 < ours < 10 * rounding < 1e-4
+    assert_exact_within_rounding(config, batches_with_repeats(minibatch_of, config, 60))
 
 
 def passes(trainer, batches):
@@ -299,8 +291,7 @@ def test_nothing_is_known_of_transitions_that_are_numbered_anew(small, trainer_o
 
 def test_two_transitions_with_one_place_are_told_apart(small, trainer_of, minibatch_of):
     config = small({"replay.capacity": 4, "replay.learn_start": 1, "dqn.target_episodes": 1000})
-    ours, rounding = bare.departures(config, batches_with_repeats(minibatch_of, config, 20))
-    assert 0 < ours < 10 * rounding < 1e-4
+    assert_exact_within_rounding(config, batches_with_repeats(minibatch_of, config, 20))
 
 
 def test_transitions_without_numbers_are_refused(small, trainer_of, minibatch_of):
@@ -316,33 +307,34 @@ def test_transitions_without_numbers_are_refused(small, trainer_of, minibatch_of
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_weights_count_as_in_the_plain_equations(preset, trainer_of, minibatch_of, threads):
-    """One step of plain Adam on the mean of weight times loss, whatever the threads that share it."""
+    """The gradient is that of the mean of weight times loss, whatever the threads that share it."""
     config = build({**flat(preset), "replay.priority": 0.6, "training.threads": threads})
     trainer = trainer_of(config)
     weight = np.array([1.0, 0.5, 0.1, 0.9, 0.3, 0.7], "<f4")
     batch = minibatch_of(config, weight=weight)
-    net = qnet.build(config, trainer.shape)
-    o, o_next = torch.tensor(batch.observation), torch.tensor(following(batch))
-    allowed, reward = torch.tensor(batch.allowed), torch.tensor(batch.reward) * config.dqn.reward_scale
-    with torch.no_grad():
-        y = dqn.target(reward, torch.tensor(batch.discount), net(o_next), allowed)  # theta- is theta yet
-    td = dqn.td_error(net(o), torch.tensor(batch.action, dtype=torch.int64), y)
-    losses = [w * dqn.loss(e[None], config.dqn.loss) for w, e in zip(weight.tolist(), td, strict=True)]
-    loss = sum(losses) / 6
-    loss.backward()
-    metrics = trainer.update(batch)
-    assert metrics.loss == pytest.approx(float(loss.detach()), rel=1e-5)
-    plain = torch.cat([p.grad.flatten() for p in net.parameters()])
-    mine = torch.cat([p.grad.flatten() for p in trainer.online.parameters()])
-    torch.testing.assert_close(mine, plain, atol=1e-5 * float(plain.abs().max()), rtol=1e-4)
+    exact, bound = rounding.gradient(config, trainer.online, trainer.target, batch)
+    uneven, _ = rounding.gradient(config, trainer.online, trainer.target, replace(batch, weight=weight[::-1].copy()))
+    t, q = bare.Tensors(batch), trainer.online(torch.tensor(batch.observation)).detach()
+    y = dqn.target(
+        t.reward * config.dqn.reward_scale, t.discount, trainer.target(t.o_next), t.allowed
+    )  # theta- is theta
+    losses = [w * dqn.loss(e[None], config.dqn.loss) for w, e in zip(weight, dqn.td_error(q, t.action, y), strict=True)]
+    assert trainer.update(batch).loss == pytest.approx(float(sum(losses) / 6), rel=1e-5)
+    found = bare.gradient(trainer.online).double()
+    assert ((found - exact).abs() <= bound).all()
+    assert ((found - uneven).abs() > bound).any(), "the bound tells nothing apart"
 
 
-def test_weights_of_one_give_the_same_weights_of_the_network(paper, trainer_of, minibatch_of):
+def test_weights_of_one_count_as_none(paper, trainer_of, minibatch_of):
     plain, weighted = trainer_of(paper), trainer_of(paper)
     for number in range(3):
         batch = minibatch_of(paper, number, b=16)
-        assert plain.update(batch) == weighted.update(replace(batch, weight=np.ones(16, "<f4")))
-    assert same(plain, weighted)
+        weighted.load(plain.state())
+        exact, bound = rounding.gradient(paper, plain.online, plain.target, batch)
+        losses = plain.update(batch).loss, weighted.update(replace(batch, weight=np.ones(16, "<f4"))).loss
+        assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+        for trainer in (plain, weighted):
+            assert ((bare.gradient(trainer.online).double() - exact).abs() <= bound).all()
 
 
 def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatch_of):

@@ -7,11 +7,11 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from tests.command import LINE, here, overfly
+from tests.command import LINE, PATIENCE, descendants, here, overfly
 from tmc.kernel.config import Journal
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
@@ -22,7 +22,7 @@ FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictur
 # Slow enough to be still in flight when all have written.
 KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", "--set", "replay.learn_start=60",
           "--set", "dqn.batch=16", "--set", "journal.flush=0.1")  # fmt: skip
-LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures", "--set", "trial.stall=0.03",
+LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures", "--set", "trial.stall=0.06",
           "--set", "comms.patience=0.5", "--set", "comms.lost_after=1", "--set", "journal.flush=0.1")  # fmt: skip
 CHUNK = 0x06
 """The opcode of a chunk of messages."""
@@ -94,12 +94,12 @@ def lose_one(out: Path) -> None:
     with subprocess.Popen([*LINE, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
         _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
         (silent,) = (
-            p for p in _descendants(run.pid) if b"--id\0001\0" in (Path("/proc") / str(p) / "cmdline").read_bytes()
+            p for p in descendants(run.pid) if b"--id\0001\0" in (Path("/proc") / str(p) / "cmdline").read_bytes()
         )
         os.kill(silent, signal.SIGSTOP)
-        time.sleep(3)
+        _await(run, lambda: "/tmc/lost" in info(out / f"tmc.mcap{ACTIVE}").topics)
         os.kill(silent, signal.SIGCONT)
-        assert run.wait(60) == 0
+        assert run.wait(PATIENCE) == 0
 
 
 def kill_in_flight(out: Path) -> None:
@@ -109,7 +109,7 @@ def kill_in_flight(out: Path) -> None:
             _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in WRITERS])
             time.sleep(0.5)
         finally:
-            family = [run.pid, *_descendants(run.pid)]  # the supervisor first: it would start the others again
+            family = [run.pid, *descendants(run.pid)]  # the supervisor first: it would start the others again
             for process in family:
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)
@@ -119,9 +119,13 @@ def kill_in_flight(out: Path) -> None:
 
 
 def _await_messages(run: subprocess.Popen[bytes], logs: list[Path]) -> None:
-    until = time.monotonic() + 60
-    while not all(map(_has_messages, logs)):
-        assert run.poll() is None and time.monotonic() < until, "the mission did not get under way"
+    _await(run, lambda: all(map(_has_messages, logs)))
+
+
+def _await(run: subprocess.Popen[bytes], what: Callable[[], bool]) -> None:
+    until = time.monotonic() + PATIENCE
+    while not what():
+        assert run.poll() is None and time.monotonic() < until, "it did not come to it while the mission flew"
         time.sleep(0.1)
 
 
@@ -130,18 +134,6 @@ def _has_messages(log: Path) -> bool:
         return bool(info(log).topics)
     except RecordError:  # not there yet, or empty
         return False
-
-
-def _descendants(process: int) -> list[int]:
-    children: dict[int, list[int]] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            parent = stat.read_text().rpartition(")")[2].split()[1]
-            children.setdefault(int(parent), []).append(int(stat.parent.name))
-    found = [process]
-    for known in found:
-        found += children.get(known, [])
-    return found[1:]
 
 
 def _alive(process: int) -> bool:

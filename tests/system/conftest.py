@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests import command
+from tests.command import PATIENCE
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -50,4 +52,7 @@ def running() -> Callable[[str], list[int]]:
 def no_process_left(tmp_path: Path) -> Iterator[None]:
     """Whatever a test started with its folder in the command line is gone when it ends."""
     yield
-    assert processes_of(str(tmp_path)) == []
+    until = time.monotonic() + PATIENCE
+    while (left := processes_of(str(tmp_path))) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert left == []

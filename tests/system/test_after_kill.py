@@ -10,14 +10,15 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from tests.command import PATIENCE
 from tmc.record.reader import Log
 
 
 def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(here, running, tmp_path: Path) -> None:
     out = tmp_path / "R"
-    command = [sys.executable, "-P", "-m", "deploy.cli", "fly", "planner:greedy", "--actors", "3", "--ticks", "20000"]
+    command = [sys.executable, "-P", "-m", "deploy.cli", "fly", "planner:greedy", "--actors", "3", "--ticks", "60000"]
     with subprocess.Popen([*command, "--out", str(out)], cwd=tmp_path, stderr=subprocess.DEVNULL) as run:
-        until = time.monotonic() + 60
+        until = time.monotonic() + PATIENCE
         while time.monotonic() < until and not flying(out / "tmc.mcap.active"):
             time.sleep(0.1)
         refused = here("log", "seal", out)
@@ -25,7 +26,7 @@ def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(here, running
         assert run.poll() is None, "the mission was over before it could be killed"
         for pid in [run.pid, *running(str(out))]:
             kill(pid)
-    until = time.monotonic() + 10
+    until = time.monotonic() + PATIENCE
     while running(str(out)) and time.monotonic() < until:
         time.sleep(0.05)
     logs = {path.name: held(path) for path in out.glob("*.active")}

@@ -16,7 +16,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from deploy.cli import main
-from tests.command import LINE
+from tests.command import LINE, PATIENCE
 from tmc.analysis.check import check
 from tmc.journal import journal_in
 from tmc.kernel.config import Journal
@@ -28,7 +28,7 @@ from tmc.record.writer import LogWriter
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 Running = Callable[[str], list[int]]
 FLIGHT = ("fly", "planner:greedy", "--actors", "3", "--ticks", "500", "--seed", "7", "--no-pictures")
-SLOW = ("--set", "trial.stall=0.005", "--set", "trial.stall_share=1.0")
+SLOW = ("--set", "trial.stall=0.01", "--set", "trial.stall_share=1.0")
 """Every UAV stalls a little, so that the mission lasts long enough to be killed in."""
 
 
@@ -45,8 +45,8 @@ def begin(tmp_path: Path, *command: str) -> subprocess.Popen[str]:
     return subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
 
 
-def wait_for(what: Callable[[], object], run: subprocess.Popen[str], seconds: float = 60) -> None:
-    until = time.monotonic() + seconds
+def wait_for(what: Callable[[], object], run: subprocess.Popen[str]) -> None:
+    until = time.monotonic() + PATIENCE
     while not what():
         assert run.poll() is None and time.monotonic() < until, "it did not come to it"
         time.sleep(0.02)
@@ -72,8 +72,8 @@ def kill_all(run: subprocess.Popen[str], running: Running, out: Path) -> None:
     for pid in running(str(out)):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    run.communicate(timeout=60)
-    until = time.monotonic() + 10
+    run.communicate(timeout=PATIENCE)
+    until = time.monotonic() + PATIENCE
     while running(str(out)) and time.monotonic() < until:
         time.sleep(0.02)
 
@@ -90,7 +90,7 @@ def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, calm
             os.kill(found[0], signal.SIGKILL)
             kills += 1
             wait_for(lambda pid=found[0]: pid not in running(str(out)), run)
-        _, errors = run.communicate(timeout=120)
+        _, errors = run.communicate(timeout=PATIENCE)
     assert run.returncode == 0, errors
     assert errors.count("tmc was killed by SIGKILL; it is started again") == 5
     assert digest(out) == calm and check(out).good

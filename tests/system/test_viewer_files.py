@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import LINE
+from tests.command import LINE, PATIENCE
 from tmc.record.reader import Log, info, run_files
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
@@ -47,7 +47,7 @@ def test_what_a_killed_mission_leaves_can_be_merged_and_replayed(here: Overfly, 
     command = [*LINE, "fly", "planner:greedy", "--actors", "2", "--out", "K",
                "--set", "journal.flush=0.1", "--ticks", "60000"]  # fmt: skip
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as mission:
-        log, end = tmp_path / "K" / "tmc.mcap.active", time.monotonic() + 60
+        log, end = tmp_path / "K" / "tmc.mcap.active", time.monotonic() + PATIENCE
         while not (log.is_file() and log.stat().st_size > 30_000) and time.monotonic() < end:
             time.sleep(0.05)
         os.kill(mission.pid, signal.SIGKILL)  # its children die with it

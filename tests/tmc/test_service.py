@@ -32,7 +32,7 @@ from tmc.wire import messages as m
 from tmc.wire import sockets
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 30_000
+PATIENCE = 100_000
 """Milliseconds in which the TMC must answer."""
 # Nothing is committed or flushed for its age while a test lasts.
 VALUES = {
@@ -41,6 +41,12 @@ VALUES = {
 }  # fmt: skip
 
 Said = TypeVar("Said", bound=m.Message)
+
+
+@pytest.fixture
+def tmp_path(short: Path) -> Path:
+    """The sockets lie beside the log."""
+    return short
 
 
 class Client:
@@ -213,12 +219,12 @@ def test_an_episode_is_committed_before_the_next_one_begins(client: Callable[[st
 
 def test_a_tmc_that_was_stopped_blames_nobody_for_the_silence(client: Callable[[str], Client], tmp_path: Path) -> None:
     """As by a suspended machine, or a commit that a slow disk holds up."""
-    short = World(build({**VALUES, "comms.lost_after": 1.5, "team.pilot": "planner:greedy"}))
+    short = World(build({**VALUES, "comms.lost_after": 3.0, "team.pilot": "planner:greedy"}))
     with killed_in_the_end(short, tmp_path) as tmc:
         uav = Uav(client("uav-000"), short, 1)
-        for _ in range(3):
+        for _ in range(2):
             tmc.send_signal(signal.SIGSTOP)
-            time.sleep(2.0)
+            time.sleep(3.5)
             tmc.send_signal(signal.SIGCONT)
             time.sleep(0.2)
             uav.exchange()

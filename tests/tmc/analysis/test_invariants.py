@@ -82,7 +82,7 @@ def alter(message: Any, draw: Callable[..., Any]) -> Any:
 
 
 @pytest.mark.parametrize("mission", MISSIONS, ids=str)
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(data=st.data())
 def test_no_change_of_a_fact_goes_unnoticed(fly: Fly, mission: dict[str, object], data: st.DataObject) -> None:
     world, entries = journal(fly(**mission))

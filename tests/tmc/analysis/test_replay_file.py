@@ -24,6 +24,7 @@ from actors.airspace import Waiting
 from actors.pilot import Pilot
 from deploy import cli
 from deploy.lockstep import LockStep
+from tests.command import PATIENCE
 from tmc.analysis import palette, replayfile
 from tmc.analysis.replayfile import TICK_NS, TRAIL, place
 from tmc.journal import Journal
@@ -459,7 +460,7 @@ def test_rerun_finds_every_topic_in_order(together: Flown) -> None:
         pytest.skip("rerun-sdk is not installed")
     path = replay(together.folder)
     done = subprocess.run(
-        [rerun, "mcap", "check", path], capture_output=True, text=True, timeout=60, check=True,
+        [rerun, "mcap", "check", path], capture_output=True, text=True, timeout=PATIENCE, check=True,
         env=os.environ | {"RUST_LOG": "error"},
     )  # fmt: skip
     rows = [line.split() for line in done.stdout.splitlines() if " /" in line]

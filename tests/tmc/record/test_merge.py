@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from deploy import cli
 from deploy.lockstep import run
 from deploy.progress import Progress
+from tests.command import PATIENCE
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas
@@ -183,7 +184,7 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, {resource.RLIM_INFINITY}))
 sys.exit(cli.main(["log", "merge", {str(flown)!r}, "--out", {str(tmp_path / "out.mcap")!r}]))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith(f"overfly: {tmp_path / 'out.mcap'} cannot be written")
     assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())

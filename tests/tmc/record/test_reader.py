@@ -97,7 +97,7 @@ def test_a_flipped_byte_is_noticed_wherever_it_is(tmp_path, finished):
         assert damage is not None, f"byte {at}"
 
 
-@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(at=st.integers(8, 10**6), new=st.binary(min_size=1, max_size=40), drop=st.integers(0, 40))
 def test_an_active_file_with_a_damaged_stretch_invents_nothing(tmp_path, active, at, new, drop):
     path = tmp_path / "tmc.mcap.active"

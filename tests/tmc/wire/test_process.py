@@ -15,7 +15,7 @@ import pytest
 from tmc.wire import process
 from tmc.wire.process import DONE, FAILED, FENCED, USAGE, die_with_parent, run
 
-PATIENCE = 20.0
+PATIENCE = 100.0
 ROOT = Path(process.__file__).parents[2]
 CHILD = """
 import os, sys, time
