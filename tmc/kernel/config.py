@@ -249,6 +249,11 @@ def flat(config: Config) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
+def differences(config: Config, other: Config) -> list[str]:
+    """The keys of the settings in which two configs differ, in order."""
+    return [key for key in SETTINGS if get(config, key) != get(other, key)]
+
+
 def build(values: Mapping[str, Any], base: Config | None = None) -> Config:
     """`base` (the paper's config by default) with dotted keys replaced, each converted to its type, all checked."""
     config = base or Config()

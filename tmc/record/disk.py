@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import IO, Any
 
+from tmc.kernel import files
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 
@@ -30,6 +31,8 @@ def left_behind(path: Path, resume: bool) -> Path | None:
 
 def open_held(path: Path, mode: str) -> Any:
     """Open a log and keep other writers away from it until it is closed; RecordError when one has it already."""
+    if mode == "rb":
+        files.check(path)
     file: IO[bytes] = open(path, mode, opener=_whole)  # noqa: SIM115  whoever asked for it closes it
     try:
         _hold(file, path)
