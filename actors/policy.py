@@ -106,7 +106,7 @@ class NetworkDecider:
                 raise FlightError(f"could not be run ({reason(error)})") from None
             total = sum(values)
             if total - total != 0.0:  # a value that is not finite makes the sum of them so, and no other can
-                shown = ", ".join(f"{value:g}" for value in values)
+                shown = ", ".join(f"{value:.3g}" for value in values)
                 raise FlightError(f"gave values that are not finite ({shown})")
             self._values, self._seen = values, sight
         return self._values

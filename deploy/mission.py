@@ -249,7 +249,7 @@ class Mission:
             "seconds": round(time.time() - self._start, 1),
         }
         try:
-            (self.out / "run.json").write_text(json.dumps(facts | more, indent=1) + "\n")
+            disk.put(self.out / "run.json", (json.dumps(facts | more, indent=1) + "\n").encode(), sync=False)
         except OSError as error:
             self.progress.note(f"cannot write {self.out / 'run.json'}: {error.strerror}")
 

@@ -81,12 +81,17 @@ def sync_folder(folder: Path) -> None:
 def put(path: Path, content: bytes, *, sync: bool) -> None:
     """Write a file whole or not at all; with `sync`, wait until the disk has it."""
     new = path.with_suffix(".new")
-    with new.open("wb") as file:
-        file.write(content)
-        if sync:
-            file.flush()
-            os.fsync(file.fileno())
-    new.replace(path)
+    new.unlink(missing_ok=True)
+    try:
+        with new.open("xb") as file:
+            file.write(content)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        new.replace(path)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
     if sync:
         sync_folder(path.parent)
 
