@@ -15,6 +15,7 @@ from operator import attrgetter
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tmc.kernel import limits
+from tmc.kernel.files import plain
 
 
 class ConfigError(ValueError):
@@ -269,7 +270,7 @@ def _setting(key: str) -> Setting:
     last = key.rsplit(".", 1)[-1]
     near = [k for k in SETTINGS if k.rsplit(".", 1)[-1] == last or k.startswith(f"{key}.")]
     hint = f"did you mean {' or '.join(near)}?" if near else "`overfly doctor --settings` lists them"
-    raise ConfigError(f"there is no setting '{key}': {hint}")
+    raise ConfigError(f"there is no setting '{plain(key, 60)}': {hint}")
 
 
 def _replace(config: Config, key: str, value: Any) -> Config:
@@ -285,7 +286,7 @@ def _convert(setting: Setting, value: Any) -> Any:
     try:
         if get_origin(kind) is Literal:
             if value not in get_args(kind):
-                raise ConfigError(f"{key} = {value!r} is none of {', '.join(map(str, get_args(kind)))}")
+                raise ConfigError(f"{key} = {plain(repr(value), 60)} is none of {', '.join(map(str, get_args(kind)))}")
             return value
         if get_origin(kind) is tuple:
             items = value.split(",") if isinstance(value, str) else value
@@ -307,7 +308,7 @@ def _convert(setting: Setting, value: Any) -> Any:
     except (TypeError, ValueError, OverflowError):
         name = getattr(kind, "__name__", str(kind))
         raise ConfigError(
-            f"{key} = {value!r} is not {'a list of int' if name == 'tuple' else f'of type {name}'}"
+            f"{key} = {plain(repr(value), 60)} is not {'a list of int' if name == 'tuple' else f'of type {name}'}"
         ) from None
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+from tmc.kernel.files import plain
+
 if TYPE_CHECKING:
     from tmc.kernel.config import Config
 
@@ -71,7 +73,7 @@ def _complaints(config: Config) -> Iterator[str]:
     for key, low, high in RANGES:
         value = attrgetter(key)(config)
         if not low <= value <= high:
-            yield f"{key} = {value} is out of range: choose {low:,.10g} to {high:,.10g}"
+            yield f"{key} = {plain(value, 60)} is out of range: choose {low:,.10g} to {high:,.10g}"
     near = min(config.team.size, int(2 * config.team.sensing_range + 1) ** 2) - 1
     if near * (min(config.T_u, config.training.ticks) + 1) > SIGHTINGS:
         yield f"a record could hold more than {SIGHTINGS:,} sightings: lower team.sensing_range, or comms.period"
@@ -90,17 +92,20 @@ def _complaints(config: Config) -> Iterator[str]:
 def learning_starts(config: Config) -> int:
     """The team's clock, in ticks from the first episode's start on, by which `replay.learn_start` transitions are in.
 
-    A transition is known n ticks later, or at the episode's end, and comes in with the next record. It may lie after
-    the mission's end.
+    A transition is known n ticks later, or at the episode's end, and is in once all UAVs have reported that tick. Where
+    they do so in turn, the clock may be later, since who is ahead depends on who is faster. It may lie after the
+    mission's end.
     """
-    ticks = config.training.ticks
+    ticks, team = config.training.ticks, range(config.team.size)
     whole, rest = divmod(-(-config.replay.learn_start // config.team.size) - 1, ticks)
     known = min(rest + config.dqn.n_step, ticks)
-    return whole * ticks + min(config.next_due(i, known) for i in range(config.team.size))
+    all_in = max(config.next_due(i, known) for i in team)
+    reported = (all_in if all_in == ticks else all_in - (all_in - config.phase(i)) % config.T_u for i in team)
+    return whole * ticks + min(reported)
 
 
 def updates(config: Config) -> int:
-    """The updates that a training makes, as its settings have it."""
+    """The updates that a training makes, as its settings have it; at most, where UAVs exchange in turn."""
     left = config.training.episodes * config.training.ticks - learning_starts(config)
     return max(0, int(left * config.replay.updates_per_tick))
 
