@@ -76,23 +76,24 @@ def check(config: Config, policy: bytes | None = None, name: str = "the policy")
 
 
 def _check(world: World, policy: bytes | None, name: str) -> None:
-    """Whether a mission can be flown in a world, and whether something would come of it."""
+    """Whether a mission can be flown in a world."""
     config = world.config
     learning = policy is None and not who.is_planner(config)
     if policy is not None:
         who.require_policy(policy, world, name)
     elif learning:
         check_view(config, view_shape(config, world.grid))
-        if idle := limits.idle(config):
-            raise ConfigError(idle)
     capacity.check(world, learning=learning)
 
 
-def remark(config: Config) -> None:
-    """Say what a training will not do, before it begins."""
-    if not who.is_planner(config):
-        for sentence in limits.remarks(config):
-            print(f"overfly: {sentence}", file=sys.stderr)
+def check_training(config: Config) -> None:
+    """Raise ConfigError where nothing would be learned in a whole mission; and say what else will not be done."""
+    if who.is_planner(config):
+        return
+    if idle := limits.idle(config):
+        raise ConfigError(idle)
+    for sentence in limits.remarks(config):
+        print(f"overfly: {sentence}", file=sys.stderr)
 
 
 def flown_policy(out: Path) -> Path:

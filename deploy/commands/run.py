@@ -35,7 +35,7 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"which preset? choose {', '.join(settings.preset_names())}, or --resume RUN")
     config = settings.config_for(args.preset, settings.chosen(args))
     world = mission.check(config)
-    mission.remark(config)
+    mission.check_training(config)
     out = mission.new_folder(args.out, args.preset)
     code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
     return code or report(out, as_json=args.json, pictures=not args.no_pictures)

@@ -47,7 +47,7 @@ def main(args: argparse.Namespace) -> int:
         config, policy, name = build(values), pilot.policy, pilot.name
     world = mission.check(config, policy, name)
     if not name:
-        mission.remark(config)
+        mission.check_training(config)
     out = mission.new_folder(args.out, "tmc")
     path = mission.keep_settings(out, world, policy)
     print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
