@@ -20,7 +20,7 @@ from tmc.wire import process
 from tmc.wire.fields import FieldError
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError, FieldError)
+MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError, FieldError, MemoryError)
 
 
 def fly(uav: int, endpoint: str, out: Path) -> int:

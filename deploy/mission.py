@@ -199,7 +199,7 @@ class Mission:
                 self._fly()
             self._seal()
         except (MissionFailed, FlightError) as failed:
-            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1 " in str(failed) else ""
+            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
             self.progress.note(f"{failed}{which}")
             return process.FAILED
         except KeyboardInterrupt as stopped:

@@ -79,10 +79,10 @@ def _of_file(name: str, path: Path, values: dict[str, Any]) -> Who:
         model = files.read_bytes(path)
         card = read_card(model)
     except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+        raise PolicyError(f"{plain(path)}: {error}") from None
     except OSError as error:
         mend = "give a policy file, a run folder or a planner"
-        raise PolicyError(f"{path} cannot be read ({error.strerror}): {mend}") from None
+        raise PolicyError(f"{plain(path)} cannot be read ({error.strerror}): {mend}") from None
     return Who(name, model, values | view_of(card) | {"team.pilot": "policy"})
 
 
@@ -113,7 +113,7 @@ def require_policy(model: bytes, world: World, name: str) -> None:
         check_policy(len(model))
         NetworkDecider(model, world.config, Observer(world))
     except PolicyError as error:
-        raise PolicyError(f"{name}: {error}") from None
+        raise PolicyError(f"{plain(name)}: {error}") from None
 
 
 def is_planner(config: Config) -> bool:

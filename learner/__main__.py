@@ -19,7 +19,7 @@ from tmc.wire import process
 from tmc.wire.fields import FieldError
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, TrainingError, FieldError)
+MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, TrainingError, FieldError, MemoryError)
 
 
 def learn(endpoint: str, out: Path) -> int:

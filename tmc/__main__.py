@@ -24,7 +24,7 @@ from tmc.wire import capacity, process
 from tmc.wire.fields import FieldError
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (ConfigError, MapError, RecordError, EndpointError, FieldError)
+MISTAKES = (ConfigError, MapError, RecordError, EndpointError, FieldError, MemoryError)
 
 
 def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, tracks: str, resume: bool = False) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from deploy.supervisor import FINAL
 from learner.trainer import Trainer
 from tmc.kernel.config import ConfigError, build, flat
 from tmc.kernel.grid import Grid
@@ -15,7 +16,7 @@ from tmc.kernel.limits import SIGHTINGS
 from tmc.kernel.policy import PolicyError, policy_bytes, view_shape
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
-from tmc.wire import capacity, fields
+from tmc.wire import capacity, fields, process
 from tmc.wire import messages as m
 
 
@@ -91,3 +92,18 @@ def test_a_policy_file_is_held_to_the_rule(change: Callable[[int], int]) -> None
     else:
         with pytest.raises(PolicyError, match="a policy may have"):
             capacity.check_policy(size)
+
+
+def test_a_message_that_breaks_its_rule_all_the_same_ends_a_process_with_a_sentence() -> None:
+    """With an exit code after which it is not started again."""
+    import actors.__main__ as uav  # noqa: PLC0415  each sets its own environment
+    import learner.__main__ as learner  # noqa: PLC0415
+    import tmc.__main__ as center  # noqa: PLC0415
+
+    def push() -> int:
+        m.Bye("uav", 0, "x" * 1025)
+        return 0
+
+    for process_of in (uav, learner, center):
+        assert process.run(push, process_of.MISTAKES) == process.USAGE
+    assert process.USAGE in FINAL
