@@ -16,10 +16,11 @@ from tmc.kernel.config import ConfigError
 from tmc.kernel.policy import PolicyError
 from tmc.kernel.roadmap import MapError
 from tmc.record.errors import RecordError
-from tmc.wire import messages, process
+from tmc.wire import process
+from tmc.wire.fields import FieldError
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError)
+MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError, FieldError, MemoryError)
 
 
 def fly(uav: int, endpoint: str, out: Path) -> int:
@@ -29,10 +30,13 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
     try:
         service.fly(stop)
     except Left as left:
-        service.say(messages.Bye("uav", uav, str(left)))
+        service.leave(str(left))
         if left.code not in {process.DONE, process.STOPPED}:
             process.tell(f"UAV {uav}: {left}")
         return stop.code if left.code == process.STOPPED else left.code
+    except PolicyError as error:
+        service.leave(str(error))
+        raise
     finally:
         service.close()
 

@@ -18,6 +18,7 @@ from actors.airspace import Airspace, Tracks
 from actors.planners import Decider, Sight, Valued
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Observer
+from tmc.kernel.policy import FlightError, PolicyError
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge
 from tmc.kernel.world import World
@@ -159,7 +160,10 @@ class Pilot:
     def on_policy(self, policy: Policy) -> None:
         """The policy that was asked for. Raises PolicyError when it cannot fly here."""
         if self.phase is Phase.POLICY and policy.version >= self.wanted:
-            self.decider = self._make_decider(policy.model)
+            try:
+                self.decider = self._make_decider(policy.model)
+            except PolicyError as error:
+                raise PolicyError(f"UAV {self.uav} cannot fly policy {policy.version}: {error}") from None
             if self.config.replay.priority:
                 assert isinstance(self.decider, Valued)
                 self._valued = self.decider
@@ -217,7 +221,7 @@ class Pilot:
             np.array(leg.cells, "<u2"), np.array(leg.actions, "u1"), np.array(leg.blocks, "u1"),
             np.array(leg.rewards, "<f4"),
             EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
-            np.nan_to_num(np.array(leg.values, "<f4")) if leg.values else NONE,  # a message takes finite numbers only
+            np.array(leg.values, "<f4") if leg.values else NONE,
             self._clock(),
         )  # fmt: skip
         self.spool.append(self.pending)
@@ -243,7 +247,15 @@ class Pilot:
         if self.t == self.config.training.ticks:
             self.phase = Phase.IDLE
             return
-        explore, draw = self._draws[self.t]
+        try:
+            self._decide(*self._draws[self.t])
+        except FlightError as error:
+            where = f"UAV {self.uav} stops at tick {self.t} of episode {self.episode}"
+            raise FlightError(f"{where}: policy {self.policy} {error}; train it again, or fly another one") from None
+        self.phase = Phase.MOVE
+
+    def _decide(self, explore: float, draw: float) -> None:
+        """Choose by the draws of the tick: the action, and what it is worth where records tell so."""
         sight = None
         if self._planner is None and explore < self._epsilon:
             self.explored += 1
@@ -256,7 +268,6 @@ class Pilot:
             self.action = self.decider.choose(sight)
         if self._valued is not None:
             self.leg.values += self._valued.worth(sight or self.sight(), self.action)
-        self.phase = Phase.MOVE
 
     def _move(self) -> None:
         cell, block = self.world.moves[self.cell][self.action]

@@ -7,15 +7,17 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
+from actors.modelfile import check_kind, check_shapes, reason
 from actors.planners import Sight
 from tmc.kernel.config import Config
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Observer
-from tmc.kernel.policy import INPUT, KEY, OUTPUT, PolicyCard, PolicyError, require
+from tmc.kernel.policy import INPUT, KEY, OUTPUT, FlightError, PolicyCard, PolicyError, require
 
 
 def open_model(model: bytes) -> tuple[Any, PolicyCard]:
-    """The session and the description of a policy file; raises PolicyError when it is none."""
+    """The session and the description of a policy file; raises PolicyError for a file that cannot be one."""
+    check_kind(model)
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
@@ -23,12 +25,14 @@ def open_model(model: bytes) -> tuple[Any, PolicyCard]:
     options.log_severity_level = 4  # a broken file is reported by us, in one sentence
     try:
         session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception:  # ONNX Runtime raises its own kinds, which it does not export
-        raise PolicyError("the file is no ONNX model that ONNX Runtime can read") from None
+    except Exception as error:  # ONNX Runtime raises its own kinds, which it does not export
+        raise PolicyError(f"ONNX Runtime {ort.__version__} cannot use the model ({reason(error)})") from None
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:
         raise PolicyError("the ONNX model is not an Overfly policy: it has no description")
-    return session, PolicyCard.from_json(text)
+    card = PolicyCard.from_json(text)
+    check_shapes(session, card)
+    return session, card
 
 
 def read_card(model: bytes) -> PolicyCard:
@@ -44,9 +48,11 @@ class NetworkDecider:
         require(card, config, observer.grid)
         self._mask, self._canvas = config.exploration.mask_blocked, observer.canvas()
         self._q = np.zeros((1, N_ACTIONS), np.float32)
+        self._values: list[float] = []
+        """Q of the nine actions in `_seen`."""
         self._seen: Sight | None = None
-        self._check()
         self._bound = self._bind()
+        self._check(observer)
 
     def _bind(self) -> Any:
         """Tell ONNX Runtime once where image and values are: a call takes a fifth less time than one that is told."""
@@ -56,37 +62,51 @@ class NetworkDecider:
         bound.bind_output(OUTPUT, "cpu", 0, np.float32, q.shape, q.ctypes.data)
         return bound
 
-    def _check(self) -> None:
-        """One forward pass, so that a model of another shape, or one that is not finite, is refused before it flies."""
+    def _check(self, observer: Observer) -> None:
+        """Refuse a model that cannot be run, or not again with the same values. What these are shows in flight only."""
+        self._canvas.draw(observer.first_cell, [], np.zeros(observer.R))
         try:
             given = self._session.run([OUTPUT], {INPUT: self._canvas.image})[0]
-        except Exception:
-            raise PolicyError("the policy does not accept the observation that its description promises") from None
-        if given.shape != self._q.shape or not np.isfinite(given).all():
-            raise PolicyError("the policy does not give nine finite action values")
+            if given.shape == self._q.shape:
+                self._run()
+        except Exception as error:
+            raise PolicyError(f"the model does not take the observation of its description ({reason(error)})") from None
+        if given.shape != self._q.shape:
+            raise PolicyError(f"the model gives values of shape {list(given.shape)}: it must be {list(self._q.shape)}")
+        if not np.array_equal(given, self._q, equal_nan=True):
+            raise PolicyError("the model gives other values when it sees the same again: it must not draw at random")
+
+    def _run(self) -> None:
+        self._session.run_with_iobinding(self._bound)
 
     def q_values(self) -> np.ndarray[Any, np.dtype[np.float32]]:
         """Q of the nine actions for the observation on the canvas; the next call writes over them."""
-        self._session.run_with_iobinding(self._bound)
+        self._run()
         q: np.ndarray[Any, np.dtype[np.float32]] = self._q[0]
         return q
 
     def choose(self, sight: Sight) -> int:
         q = self._look(sight)
         if self._mask:
-            return max(sight.allowed, key=q.tolist().__getitem__)
-        return int(q.argmax())
+            return max(sight.allowed, key=q.__getitem__)
+        return q.index(max(q))
 
     def worth(self, sight: Sight, action: int) -> tuple[float, float]:
         """Q(o, a), and the largest Q(o, .) among the actions that `choose` chooses from."""
-        q = self._look(sight).tolist()
+        q = self._look(sight)
         return q[action], max(q[a] for a in sight.allowed) if self._mask else max(q)
 
-    def _look(self, sight: Sight) -> np.ndarray[Any, np.dtype[np.float32]]:
-        """Q of what is in sight; who asks again about the last one gets what was computed."""
+    def _look(self, sight: Sight) -> list[float]:
+        """Q of what is in sight; who asks again about the last one gets what was computed. Raises FlightError."""
         if sight is not self._seen:
             self._canvas.draw(sight.cell, sight.peers, sight.u)
-            self.q_values()
-            self._seen = sight
-        q: np.ndarray[Any, np.dtype[np.float32]] = self._q[0]
-        return q
+            try:
+                values: list[float] = self.q_values().tolist()
+            except Exception as error:  # as above: what a model does may depend on what it sees
+                raise FlightError(f"could not be run ({reason(error)})") from None
+            total = sum(values)
+            if total - total != 0.0:  # a value that is not finite makes the sum of them so, and no other can
+                shown = ", ".join(f"{value:.3g}" for value in values)
+                raise FlightError(f"gave values that are not finite ({shown})")
+            self._values, self._seen = values, sight
+        return self._values

@@ -20,8 +20,9 @@ from actors.stalls import Lead, StallingTracks, stalls
 from actors.tracks import TableTracks, open_table
 from actors.witness import Oath, Witness
 from tmc.kernel.config import build
+from tmc.kernel.files import plain
 from tmc.kernel.observation import Observer
-from tmc.kernel.world import World
+from tmc.kernel.world import world_of_run
 from tmc.record.builders import location_fix
 from tmc.record.channels import ACTIVE, uav_topic
 from tmc.record.reader import Log
@@ -114,7 +115,7 @@ class Service:
 
     def _make_pilot(self, welcome: m.Welcome) -> tuple[Pilot, RadioTracks | None]:
         config = build(json.loads(welcome.config))
-        world = World(config)
+        world = world_of_run(config, self.out)
         if world.map.fingerprint != welcome.map:
             raise Left(process.USAGE, f"the map '{config.world.map}' here is not the one that the TMC flies: copy it")
         self.out.mkdir(parents=True, exist_ok=True)
@@ -165,6 +166,10 @@ class Service:
         """Put a message on the air; it may be lost."""
         self._said = time.monotonic()
         sockets.send(self.sock, message)
+
+    def leave(self, reason: str) -> None:
+        """Tell the TMC why this process ends."""
+        self.say(m.Bye("uav", self.uav, plain(reason)))
 
     def _beacon(self, beacon: m.Beacon) -> None:
         sockets.send(self.sock, beacon)

@@ -52,7 +52,7 @@ def mistakes() -> tuple[type[Exception], ...]:
     from tmc.record.errors import RecordError  # noqa: PLC0415
     from tmc.wire.sockets import EndpointError  # noqa: PLC0415
 
-    return ConfigError, PolicyError, MapError, RecordError, EndpointError
+    return ConfigError, PolicyError, MapError, RecordError, EndpointError, MemoryError
 
 
 class _Version(argparse.Action):

@@ -18,18 +18,19 @@ from actors.tracks import create_table
 from deploy import lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
-from tmc.analysis.setting import attachments, config_of
+from tmc.analysis.setting import attachments, settings_of
 from tmc.journal import journal_in
+from tmc.kernel import files, limits
 from tmc.kernel.config import Config, ConfigError, flat
-from tmc.kernel.policy import check_view, view_shape
+from tmc.kernel.policy import FlightError, check_view, view_shape
+from tmc.kernel.roadmap import COPY
 from tmc.kernel.uncertainty import lower_bound
-from tmc.kernel.world import World
+from tmc.kernel.world import World, world_of_run
 from tmc.record import disk
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.record.seal import seal_log
-from tmc.wire import process
-from tmc.wire.fields import FRAME_LIMIT
+from tmc.wire import capacity, process
 
 POLL = 0.1
 """Seconds between two looks at the processes."""
@@ -61,20 +62,38 @@ def bound_of(world: World) -> float:
     return lower_bound(world.alpha, config.team.size, config.training.ticks)
 
 
-def check(config: Config, policy: bytes | None = None) -> World:
-    """The world of a mission, once everything that can be wrong with its settings has been looked at."""
+def check(config: Config, policy: bytes | None = None, name: str = "the policy") -> World:
+    """The world of a mission, once everything that can be wrong with its settings has been looked at.
+
+    `name`: what messages call the policy.
+    """
     if config.team.pilot != "policy" and config.team.pilot.removeprefix(PREFIX) not in PLANNERS:
         known = ", ".join(PREFIX + name for name in PLANNERS)
         raise ConfigError(f"team.pilot = {config.team.pilot} is neither policy nor {known}")
     world = World(config)
-    if policy is not None:
-        who.require_policy(policy, world)
-    elif not who.is_planner(config):
-        check_view(config, view_shape(config, world.grid))
-        most = FRAME_LIMIT // (2 * 4 * max(world.law.cells.size, 1))  # two maps of float32 a transition, in one frame
-        if config.dqn.batch > most:
-            raise ConfigError(f"dqn.batch = {config.dqn.batch} is too large to send: choose {most} or less")
+    _check(world, policy, name)
     return world
+
+
+def _check(world: World, policy: bytes | None, name: str) -> None:
+    """Whether a mission can be flown in a world."""
+    config = world.config
+    learning = policy is None and not who.is_planner(config)
+    if policy is not None:
+        who.require_policy(policy, world, name)
+    elif learning:
+        check_view(config, view_shape(config, world.grid))
+    capacity.check(world, learning=learning)
+
+
+def check_training(config: Config) -> None:
+    """Raise ConfigError where nothing would be learned in a whole mission; and say what else will not be done."""
+    if who.is_planner(config):
+        return
+    if idle := limits.idle(config):
+        raise ConfigError(idle)
+    for sentence in limits.remarks(config):
+        print(f"overfly: {sentence}", file=sys.stderr)
 
 
 def flown_policy(out: Path) -> Path:
@@ -82,33 +101,50 @@ def flown_policy(out: Path) -> Path:
     return out / "policies" / "flown.onnx"
 
 
-def interrupted(out: Path) -> tuple[World, bytes | None]:
-    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError."""
+def require_settings(out: Path) -> Config:
+    """The settings that a run in `out` was begun with; ConfigError where `config.json` has others, or it has none."""
     journal = journal_in(out)
     if journal is None:
         raise ConfigError(f"{out} holds no journal (tmc.mcap): --resume takes the folder of a run that was begun")
-    config = config_of(out, journal)
+    settings = settings_of(out, journal)
+    if settings.edited:
+        keys = ", ".join(settings.edited)
+        mend = "put it back, or remove the file and the log's settings are used; other settings need a run of their own"
+        raise ConfigError(f"{out / 'config.json'} was edited since the run was begun, in {keys}: {mend}")
+    return settings.config
+
+
+def interrupted(out: Path) -> tuple[World, bytes | None]:
+    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError."""
+    config = require_settings(out)
+    journal = journal_in(out)
+    assert journal is not None
     with disk.open_held(journal, "rb"):
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
         text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
         process.tell(f"{text}, and `overfly log recover` says what else is in it")
     file = flown_policy(out)
-    policy = file.read_bytes() if file.exists() else None
-    world = check(config, policy)
+    policy = files.read_bytes(file) if file.exists() else None
+    world = world_of_run(config, out)
+    _check(world, policy, str(file))
     if attachments(journal).get("map.csv", world.map.csv()) != world.map.csv():
-        raise ConfigError(f"the map {config.world.map} has changed since the run was begun: put it back as it was")
+        name = out / COPY if (out / COPY).exists() else config.world.map
+        raise ConfigError(f"the map {name} has changed since the run was begun: put it back as it was")
     if log.metadata().get("run") == lockstep.RUN and policy is None and not who.is_planner(config):
         raise ConfigError(f"{out} was trained in lock step, which leaves no checkpoint to go on from: run it again")
     return world, policy
 
 
-def keep_settings(out: Path, config: Config, policy: bytes | None) -> Path | None:
-    """Put down what a run flies by, before it begins: `config.json`, and the fixed policy, whose path it returns.
+def keep_settings(out: Path, world: World, policy: bytes | None) -> Path | None:
+    """Put down what a run flies by, before it begins: `config.json`, a user's map, and the fixed policy, whose path it
+    returns.
 
     On the disk at once, since after a power cut there is no journal yet that has a copy.
     """
-    disk.put(out / "config.json", (json.dumps(flat(config), indent=1) + "\n").encode(), sync=True)
+    disk.put(out / "config.json", (json.dumps(flat(world.config), indent=1) + "\n").encode(), sync=True)
+    if world.map.source:
+        disk.put(out / COPY, world.map.source.encode(), sync=True)
     if policy is None:
         return None
     file = flown_policy(out)
@@ -126,7 +162,7 @@ def finished(out: Path) -> bool:
 def _told(out: Path) -> dict[str, Any]:
     """What `run.json` says; nothing where it is gone or broken."""
     try:
-        told = json.loads((out / "run.json").read_text("utf-8"))
+        told = json.loads(files.read_text(out / "run.json"))
     except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
@@ -136,11 +172,18 @@ class Mission:
     """One mission in its run folder; `world` comes from `check`."""
 
     def __init__(
-        self, world: World, out: Path, command: str, policy: bytes | None = None, progress: Progress | None = None
+        self,
+        world: World,
+        out: Path,
+        command: str,
+        policy: bytes | None = None,
+        progress: Progress | None = None,
+        flies: str = "",
     ) -> None:
         config = world.config
         self.world, self.config, self.out, self.command = world, config, out, command
-        self.policy = keep_settings(out, config, policy)
+        self.policy = keep_settings(out, world, policy)
+        self.flies = flies or str(self.policy)
         self.progress = progress or Progress(config, self.world.law.cells.size, bound_of(self.world))
         self._begun, self._start = _told(out), time.time()
         self._ended: dict[str, Any] = {}
@@ -156,8 +199,9 @@ class Mission:
             else:
                 self._fly()
             self._seal()
-        except MissionFailed as failed:
-            code, said = process.FAILED, str(failed)
+        except (MissionFailed, FlightError) as failed:
+            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
+            code, said = process.FAILED, f"{failed}{which}"
         except KeyboardInterrupt as stopped:
             code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
             said = f"stopped; what was flown is in {self.out}"

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
-from tmc.kernel.config import Config, ConfigError, build, flat
-from tmc.kernel.policy import PolicyCard, PolicyError, require
+from tmc.analysis.setting import settings_of
+from tmc.journal import journal_in
+from tmc.kernel import files
+from tmc.kernel.config import Config, ConfigError, flat
+from tmc.kernel.files import plain
+from tmc.kernel.observation import Observer
+from tmc.kernel.policy import PolicyCard, PolicyError
+from tmc.kernel.roadmap import COPY, builtin_maps
 from tmc.kernel.world import World
+from tmc.wire import process
+from tmc.wire.capacity import check_policy
 
 
 @dataclass(frozen=True)
@@ -28,41 +36,53 @@ def resolve(name: str) -> Who:
         if name.removeprefix(PREFIX) not in PLANNERS:
             raise ConfigError(f"there is no planner '{name}': choose {', '.join(PREFIX + p for p in PLANNERS)}")
         return Who(name, None, {"team.pilot": name})
-    path = Path(name)
-    if path.is_dir():
-        return _of_run(path)
-    if not path.is_file():
+    try:
+        is_folder = stat.S_ISDIR(Path(name).stat().st_mode)
+    except (OSError, ValueError):  # nothing of that name, or a name that nothing can have
         known = ", ".join(PREFIX + p for p in PLANNERS)
-        raise ConfigError(f"'{name}' is no policy file and no run folder: write one of these, or {known}")
-    return _of_file(name, path, {})
+        text = f"'{plain(name)}' is no policy file and no run folder: write one of these, or {known}"
+        raise ConfigError(text) from None
+    if is_folder:
+        return _of_run(Path(name))
+    return _of_file(name, Path(name), {})
 
 
 def _of_run(folder: Path) -> Who:
     """The final policy of a run, in the mission that it was trained for."""
-    config, policy = folder / "config.json", folder / "policies" / "final.onnx"
-    if not config.is_file():
+    journal, policy = journal_in(folder), folder / "policies" / "final.onnx"
+    if journal is None and not (folder / "config.json").exists():
         raise ConfigError(f"{folder} is no run folder: it has no config.json")
-    try:
-        values = dict(flat(build(json.loads(config.read_text("utf-8")))))
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ConfigError(f"{config} cannot be read: {error}") from None
-    if values.get("team.pilot", "policy") != "policy":
+    settings = settings_of(folder, journal)
+    for note in settings.notes:
+        process.tell(f"{folder}: {note}")
+    values = dict(flat(settings.config)) | _map_of(folder, settings.config)
+    if values["team.pilot"] != "policy":
         return Who(str(folder), None, values)
-    if not policy.is_file():
+    if not policy.exists():
         policy = folder / "policies" / "flown.onnx"
-    if not policy.is_file():
+    if not policy.exists():
         raise ConfigError(f"{folder} has no final policy: its training did not end")
     return _of_file(str(folder), policy, values)
+
+
+def _map_of(folder: Path, config: Config) -> dict[str, Any]:
+    """The map of a run that flew over a user's map: the copy in its folder, where there is one."""
+    copy = folder / COPY
+    return {"world.map": str(copy)} if config.world.map not in builtin_maps() and copy.exists() else {}
 
 
 def _of_file(name: str, path: Path, values: dict[str, Any]) -> Who:
     from actors.policy import read_card  # noqa: PLC0415  ONNX Runtime only where a policy flies
 
-    model = path.read_bytes()
     try:
+        check_policy(path.stat().st_size)
+        model = files.read_bytes(path)
         card = read_card(model)
     except PolicyError as error:
-        raise PolicyError(f"{path}: {error}") from None
+        raise PolicyError(f"{plain(path)}: {error}") from None
+    except OSError as error:
+        mend = "give a policy file, a run folder or a planner"
+        raise PolicyError(f"{plain(path)} cannot be read ({error.strerror}): {mend}") from None
     return Who(name, model, values | view_of(card) | {"team.pilot": "policy"})
 
 
@@ -85,11 +105,15 @@ FIXED = {"exploration.start": 0.0, "exploration.end": 0.0}
 """A fixed policy flies as it is, without exploration."""
 
 
-def require_policy(model: bytes, world: World) -> None:
-    """Raise PolicyError unless this policy can fly in this world."""
-    from actors.policy import read_card  # noqa: PLC0415  as above
+def require_policy(model: bytes, world: World, name: str) -> None:
+    """Raise PolicyError, which names the policy, unless it can fly in this world, as far as can be seen before."""
+    from actors.policy import NetworkDecider  # noqa: PLC0415  as above
 
-    require(read_card(model), world.config, world.grid)
+    try:
+        check_policy(len(model))
+        NetworkDecider(model, world.config, Observer(world))
+    except PolicyError as error:
+        raise PolicyError(f"{plain(name)}: {error}") from None
 
 
 def is_planner(config: Config) -> bool:

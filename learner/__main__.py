@@ -16,9 +16,10 @@ from tmc.kernel.config import ConfigError
 from tmc.kernel.roadmap import MapError
 from tmc.record.errors import RecordError
 from tmc.wire import process
+from tmc.wire.fields import FieldError
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, TrainingError)
+MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, TrainingError, FieldError, MemoryError)
 
 
 def learn(endpoint: str, out: Path) -> int:

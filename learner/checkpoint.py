@@ -20,6 +20,7 @@ from safetensors.torch import save as to_safetensors
 from torch import Tensor
 
 from learner.trainer import State, Trainer, layout
+from tmc.kernel import files
 from tmc.kernel.config import flat
 
 FORMAT = 1
@@ -122,6 +123,7 @@ def read(path: Path) -> Saved:
     """What a checkpoint holds. Raises CheckpointError for one that is damaged or of a foreign format."""
     damaged = f"the checkpoint {path.name} is damaged or cut short: delete it to go on from an older one"
     try:
+        files.check(path)
         with safe_open(path, framework="pt") as file:
             notes = file.metadata() or {}
             tensors: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

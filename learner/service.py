@@ -15,13 +15,14 @@ from learner import checkpoint
 from learner.checkpoint import CheckpointError, Saved
 from learner.intake import Intake
 from learner.trainer import UpdateMetrics, start
+from tmc.kernel import files
 from tmc.kernel.config import build
 from tmc.kernel.observation import Observer
-from tmc.kernel.world import World
+from tmc.kernel.world import world_of_run
 from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
+from tmc.wire import capacity, process, sockets
 from tmc.wire import messages as m
-from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
 from tmc.wire.sockets import EndpointError
 
@@ -95,7 +96,8 @@ class Service:
 
     def _prepare(self, welcome: m.Welcome, saved: Saved | None) -> None:
         config = build(json.loads(welcome.config))
-        world = World(config)
+        world = world_of_run(config, self.out)
+        capacity.check(world, learning=True)
         if world.map.fingerprint != welcome.map:
             raise EndpointError(f"the map '{config.world.map}' here is not the one that the TMC flies: copy it")
         self._own(welcome.run)
@@ -114,7 +116,7 @@ class Service:
     def _own(self, run: str) -> None:
         """Refuse a folder with the checkpoints of another mission: the learner would go on from them."""
         mark = self.out / "learner.run"
-        if mark.exists() and not run.startswith(mark.read_text("utf-8").strip()):  # a power cut may leave half of it
+        if mark.exists() and not run.startswith(files.read_text(mark).strip()):  # a power cut may leave half of it
             raise EndpointError(f"{self.out} holds what was learned in another mission: choose another --out")
         self.out.mkdir(parents=True, exist_ok=True)
         mark.write_text(run + "\n", "utf-8")

@@ -10,19 +10,21 @@ import uuid
 from pathlib import Path
 
 from tmc.journal import Journal, journal_in
+from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.roadmap import MapError
-from tmc.kernel.world import World
+from tmc.kernel.world import world_of_run
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.recovery import recover
 from tmc.roster import Outbox
 from tmc.service import Service
 from tmc.station import Station
-from tmc.wire import process
+from tmc.wire import capacity, process
+from tmc.wire.fields import FieldError
 from tmc.wire.sockets import EndpointError
 
-MISTAKES = (ConfigError, MapError, RecordError, EndpointError)
+MISTAKES = (ConfigError, MapError, RecordError, EndpointError, FieldError, MemoryError)
 
 
 def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, tracks: str, resume: bool = False) -> int:
@@ -31,10 +33,12 @@ def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, trac
     `resume`: go on with the journal in `out`, if there is one.
     """
     stop = process.Stop()
-    world = World(config)
+    world = world_of_run(config, out)
     run = (run_of(out, config) if resume else None) or uuid.uuid4().hex[:12]
     learning = policy is None and config.team.pilot == "policy"
-    station = Station(world, run, learning=learning, policy=policy.read_bytes() if policy else None, tracks=tracks)
+    capacity.check(world, learning=learning)
+    model = files.read_bytes(policy) if policy else None
+    station = Station(world, run, learning=learning, policy=model, tracks=tracks)
     out.mkdir(parents=True, exist_ok=True)
     journal = Journal(out, world, run, resume=resume)
     if journal.found:
@@ -85,7 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     process.become_child(a.parent)
 
     def start() -> int:
-        config = build(json.loads(a.config.read_text("utf-8")))
+        config = build(json.loads(files.read_text(a.config)))
         return serve(config, a.bind, a.out, policy=a.policy, tracks=a.tracks, resume=a.resume)
 
     return process.run_child(start, MISTAKES)

@@ -17,6 +17,7 @@ from typing import Any
 from tmc.entries import Entry
 from tmc.flight import RefusedError
 from tmc.journal import policy_path
+from tmc.kernel import files
 from tmc.kernel.config import Config
 from tmc.record.builders import to_record
 from tmc.record.errors import RecordError
@@ -211,7 +212,7 @@ def _policy(station: Station, message: Any, folder: Path, _now: float) -> None:
 def _model(message: Any, folder: Path) -> bytes:
     """The policy file, if it is still there and whole."""
     try:
-        model = bytes(message.model) or policy_path(folder, message.version).read_bytes()
+        model = bytes(message.model) or files.read_bytes(policy_path(folder, message.version))
     except OSError:
         return b""
     return model if hashlib.sha256(model).hexdigest() == message.sha256 else b""

@@ -13,6 +13,7 @@ from tmc.analysis.flown import Flown, read
 from tmc.analysis.metrics import summarize
 from tmc.analysis.summary import Summary
 from tmc.kernel.config import ConfigError
+from tmc.record import disk
 from tmc.record.errors import RecordError
 
 NO_MATPLOTLIB = "no pictures, as matplotlib is not installed: pip install 'overfly[figures]'"
@@ -61,22 +62,29 @@ def report(
     pictures: bool = True,
     baselines: Mapping[str, float] | None = None,
 ) -> int:
-    """Write RUN/summary.json and RUN/report/*.png, and print the summary; RecordError when RUN holds no flight."""
+    """Print the summary, and keep it as RUN/summary.json with RUN/report/*.png; RecordError when RUN holds no flight.
+
+    What cannot be written is said, and is no failure: the summary is there to be read.
+    """
     flown = read(run)
     summary = summarize(flown)
     if episode is not None:
         flown.episode(episode)
-    _write(run / "summary.json", summary.to_json() + "\n")
-    made = _draw(flown, summary, episode, baselines or {}) if pictures else []
-    print(summary.to_json() if as_json else reports.text(summary, made))
+    kept = _keep(run / "summary.json", summary.to_json() + "\n", pictures=pictures)
+    made = _draw(flown, summary, episode, baselines or {}) if pictures and kept else []
+    print(summary.to_json() if as_json else reports.text(summary, made, kept=kept))
     return 0
 
 
-def _write(path: Path, text: str) -> None:
+def _keep(path: Path, text: str, *, pictures: bool) -> bool:
+    """Write the summary; False, and a sentence on stderr, where that cannot be."""
     try:
-        path.write_text(text, "utf-8")
+        disk.put(path, text.encode(), sync=False)
     except OSError as error:
-        raise RecordError(f"{path} cannot be written ({error.strerror}): make the run folder writable") from None
+        lost = "the summary is printed only" + (", and no pictures are made" if pictures else "")
+        print(f"overfly: {path} cannot be written ({error.strerror}): {lost}", file=sys.stderr)
+        return False
+    return True
 
 
 def _draw(flown: Flown, summary: Summary, episode: int | None, lines: Mapping[str, float]) -> list[Path]:
@@ -88,4 +96,8 @@ def _draw(flown: Flown, summary: Summary, episode: int | None, lines: Mapping[st
             raise
         print(f"overfly: {NO_MATPLOTLIB}", file=sys.stderr)
         return []
-    return figures.draw(flown, summary, episode, lines)
+    try:
+        return figures.draw(flown, summary, episode, lines)
+    except RecordError as error:
+        print(f"overfly: no pictures: {error}", file=sys.stderr)
+        return []

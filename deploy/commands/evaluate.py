@@ -16,8 +16,11 @@ from typing import Any
 from deploy import lockstep, pool, settings, who
 from deploy.mission import bound_of, check
 from tmc.kernel.config import Config, ConfigError, build
+from tmc.kernel.policy import FlightError
+from tmc.kernel.roadmap import builtin_maps, load_map
 from tmc.kernel.world import World
 from tmc.roster import Outbox
+from tmc.wire.process import FAILED
 
 FIRST_SEED = 1_000_000
 """Seeds of an evaluation start here, far from those that people train with."""
@@ -77,7 +80,11 @@ def main(args: argparse.Namespace) -> int:
     if args.seed is not None or args.episodes is not None:
         raise ConfigError("evaluate flies one episode a seed: choose them with --seeds and --first-seed")
     work = list(missions(args))
-    rows = table(fly_all(work, args.jobs))
+    try:
+        rows = table(fly_all(work, args.jobs))
+    except FlightError as error:
+        print(f"overfly: {error}", file=sys.stderr)
+        return FAILED
     if args.json:
         for row in rows:
             values = asdict(row).items()  # nan is no JSON
@@ -105,7 +112,7 @@ def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | No
             values |= {"team.pilot": pilot.values["team.pilot"]}
             values |= {} if n is None else {"team.size": n}
             config = build(values)
-            check(config, pilot.policy)
+            check(config, pilot.policy, pilot.name)
             for seed in range(args.first_seed, args.first_seed + args.seeds):
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy
 
@@ -116,10 +123,17 @@ def shared_world(pilots: list[who.Who], chosen: Collection[str] = ()) -> dict[st
     worlds = [{k: v for k, v in p.values.items() if k in WORLD or k.startswith("world.")} for p in pilots]
     worlds = [world for world in worlds if world]
     for world in worlds[1:]:
-        differ = [key for key in world if key not in chosen and world[key] != worlds[0].get(key)]
+        differ = [key for key in world if key not in chosen and not _same(key, world[key], worlds[0].get(key))]
         if differ:
             raise ConfigError(f"the runs differ in {', '.join(differ)}: set it for all of them with --set, or apart")
     return worlds[0] if worlds else {}
+
+
+def _same(key: str, value: Any, other: Any) -> bool:
+    """Whether two runs agree in a setting: of their maps, each of which lies in its run's folder, the text counts."""
+    if key == "world.map" and value != other and not {value, other} & {*builtin_maps()}:
+        return load_map(value).source == load_map(other).source
+    return bool(value == other)
 
 
 def fly_one(mission: tuple[str, Config, bytes | None]) -> Flight:
@@ -128,7 +142,10 @@ def fly_one(mission: tuple[str, Config, bytes | None]) -> Flight:
     world = World(config)
     start = time.perf_counter()
     fleet = lockstep.LockStep(world, policy, _forget)
-    fleet.run()
+    try:
+        fleet.run()
+    except FlightError as error:
+        raise FlightError(f"{name}, seed {config.training.seed}: {error}") from None
     station, cells = fleet.station, world.law.cells.size
     seconds = time.perf_counter() - start
     return Flight(

@@ -21,7 +21,8 @@ def main(args: argparse.Namespace) -> int:
     """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
     pilot = who.resolve(args.who)
     values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args), **who.pilot_of(pilot)}
-    world = mission.check(build(values), pilot.policy)
+    world = mission.check(build(values), pilot.policy, pilot.name)
     out = mission.new_folder(args.out, "fly")
-    code = mission.Mission(world, out, mission.command_line(), pilot.policy).run(in_one_process=args.lockstep)
+    flight = mission.Mission(world, out, mission.command_line(), pilot.policy, flies=pilot.name)
+    code = flight.run(in_one_process=args.lockstep)
     return code or report(out, as_json=args.json, pictures=not args.no_pictures)

@@ -7,14 +7,15 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from tmc.kernel.rastertext import COMMENT, raster_text
 from tmc.kernel.roadmap import OBSTACLES, ROADS, MapError, RoadMap, builtin_maps, check, load_map
 
 DEFAULT = "downtown-toronto"
 NO_MATPLOTLIB = "a picture needs matplotlib: pip install 'overfly[figures]'"
 ABOUT = {
     "list": "the maps that come with Overfly, and what their presets count",
-    "show": "draw a map as text, and as a picture with --out",
-    "export": "the grid as CSV, a line a row from the north: 0 free, 1 road, 2 blocked",
+    "show": "draw a map as text that --map takes, and as a picture with --out",
+    "export": "the grid as CSV, a line a row from the north: 0 free, 1 road, 2 blocked; --map takes it",
     "check": "what to look at before flying a map; exit code 1 when there is something",
 }
 
@@ -62,21 +63,22 @@ def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
     print(drawing(road_map))
     if out is not None:
         _picture(road_map, out)
-        print(f"picture: {out}")
+        print(f"{COMMENT} picture: {out}")
     return 0
 
 
 def drawing(road_map: RoadMap) -> str:
-    """The map as text, street-north on top, then the legend with counts; square where the lines are short enough."""
+    """The map as text that `--map` takes, street-north on top, then the legend; square where lines are short enough."""
     m, total = road_map, road_map.grid.size
     rows = m.text().splitlines()
     wide = [" ".join(row) for row in rows] if m.grid.cols <= 40 else rows
     road, blocked = int(m.road.sum()), int(m.blocked.sum())
-    size = f"{m.grid.rows} x {m.grid.cols} cells of {m.cell_m:g} m"
+    size = f"{m.grid.rows} x {m.grid.cols} cells of {m.cell_m:g} m, street-north on top"
     counts = (("#", "road", road), (".", "free", total - road - blocked), ("X", "obstacle or no-fly", blocked))
     legend = ", ".join(f"{sign} {what} {count:,} ({count / total:.0%})" for sign, what, count in counts)
-    credit = [m.attribution] if m.attribution else []
-    return "\n".join([*wide, "", f"{m.name}: {size}, street-north on top", legend, *credit])
+    header = {"name": m.name, "cell_m": repr(float(m.cell_m)).removesuffix(".0")}
+    header |= {"attribution": m.attribution} if m.attribution else {}
+    return raster_text(header, wide, [size, legend]).removesuffix("\n")
 
 
 def _picture(road_map: RoadMap, out: Path) -> None:

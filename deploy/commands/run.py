@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from deploy import mission, settings
@@ -34,6 +35,7 @@ def main(args: argparse.Namespace) -> int:
         raise ConfigError(f"which preset? choose {', '.join(settings.preset_names())}, or --resume RUN")
     config = settings.config_for(args.preset, settings.chosen(args))
     world = mission.check(config)
+    mission.check_training(config)
     out = mission.new_folder(args.out, args.preset)
     code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
     return code or report(out, as_json=args.json, pictures=not args.no_pictures)
@@ -46,6 +48,8 @@ def resume(args: argparse.Namespace) -> int:
             "--resume goes on with its own settings, as processes: give it nothing but --json, --no-pictures"
         )
     if mission.finished(args.resume):
+        mission.require_settings(args.resume)
+        print(f"overfly: {args.resume} was flown to its end: this is its summary", file=sys.stderr)
         return report(args.resume, as_json=args.json, pictures=not args.no_pictures)
     world, policy = mission.interrupted(args.resume)
     code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)

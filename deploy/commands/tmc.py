@@ -33,7 +33,7 @@ def main(args: argparse.Namespace) -> int:
     if args.resume is not None:
         return resume(args)
     config = settings.config_for(args.preset, settings.chosen(args))
-    policy = None
+    policy, name = None, ""
     if args.fly:
         pilot = who.resolve(args.fly)
         values = {
@@ -44,10 +44,12 @@ def main(args: argparse.Namespace) -> int:
             **settings.chosen(args),
             **who.pilot_of(pilot),
         }
-        config, policy = build(values), pilot.policy
-    mission.check(config, policy)
+        config, policy, name = build(values), pilot.policy, pilot.name
+    world = mission.check(config, policy, name)
+    if not name:
+        mission.check_training(config)
     out = mission.new_folder(args.out, "tmc")
-    path = mission.keep_settings(out, config, policy)
+    path = mission.keep_settings(out, world, policy)
     print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
     return _sealed(serve(config, args.bind, out, policy=path, tracks=""), config, out)
 

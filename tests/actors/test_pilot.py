@@ -14,6 +14,7 @@ from actors.planners import Decider, Sight
 from actors.tracks import TableTracks, TrackTable
 from tmc.kernel.draws import Stream, uniforms
 from tmc.kernel.observation import Observer
+from tmc.kernel.policy import FlightError, PolicyError
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
 from tmc.wire.messages import EMPTY, Begin, Map, Policy, PolicyRequest, Record
@@ -304,7 +305,7 @@ def test_exploration_is_addressed(world_of: Callable[..., World], mask: bool) ->
 
 
 class Worthy(Script):
-    """A script that says what an action is worth: its number, and 8 or what else it is told is the best."""
+    """A script that says what an action is worth: its number, and 8 for the best."""
 
     best = 8.0
 
@@ -313,23 +314,63 @@ class Worthy(Script):
 
 
 def test_each_move_is_told_with_its_worth_where_priorities_are_on(world_of: Callable[..., World]) -> None:
-    """Whether exploration chose it or not; numbers that no message takes are the nearest that it does."""
+    """Whether exploration chose it or not."""
     values = {"exploration.start": 0.5, "exploration.end": 0.5, "comms.period": 30, "replay.priority": 0.6}
-    for best in (8.0, np.inf):
-        pilot, _, world = learning(world_of, **values)
-        pilot._make_decider = lambda _: policy  # noqa: B023
-        policy = Worthy([STAY] * 1000)
-        policy.best = best
-        pilot.begin(begin(world, 7, world.starts(7)[0], policy=1))
-        pilot.on_policy(Policy(1, b""))
-        record = pilot.advance()
-        assert record is not None and record.values.size == 0  # no move yet
-        pilot.on_map(answer(world, 7, 0, policy=1))
-        record = pilot.advance()
-        assert record is not None and record.tick == 30 and pilot.explored > 5
-        told = record.values.reshape(30, 2)
-        assert told[:, 0].tolist() == record.actions.tolist()
-        assert set(told[:, 1].tolist()) == {min(best, float(np.finfo(np.float32).max))}
+    pilot, _, world = learning(world_of, **values)
+    policy = Worthy([STAY] * 1000)
+    pilot._make_decider = lambda _: policy
+    pilot.begin(begin(world, 7, world.starts(7)[0], policy=1))
+    pilot.on_policy(Policy(1, b""))
+    record = pilot.advance()
+    assert record is not None and record.values.size == 0  # no move yet
+    pilot.on_map(answer(world, 7, 0, policy=1))
+    record = pilot.advance()
+    assert record is not None and record.tick == 30 and pilot.explored > 5
+    told = record.values.reshape(30, 2)
+    assert told[:, 0].tolist() == record.actions.tolist()
+    assert set(told[:, 1].tolist()) == {policy.best}
+
+
+@pytest.mark.parametrize("explores", [0.0, 1.0])
+def test_a_policy_that_fails_in_flight_names_uav_tick_and_policy(
+    world_of: Callable[..., World], explores: float
+) -> None:
+    """Also where exploration chooses and the policy only says what that is worth."""
+    values = {"exploration.start": explores, "exploration.end": explores, "replay.priority": 0.6}
+    pilot, _, world = learning(world_of, **values)
+
+    class Failing(Worthy):
+        def choose(self, sight: Any) -> int:
+            return self.fail(sight) or super().choose(sight)
+
+        def worth(self, sight: Any, action: int) -> tuple[float, float]:
+            return (self.fail(sight), 0.0)
+
+        def fail(self, sight: Any) -> int:
+            if sight.tick == 3:
+                raise FlightError("gave values that are not finite (nan)")
+            return 0
+
+    pilot._make_decider = lambda _: Failing([STAY] * 1000)
+    pilot.begin(begin(world, 7, world.starts(7)[0], policy=5))
+    pilot.on_policy(Policy(5, b""))
+    pilot.advance()
+    pilot.on_map(answer(world, 7, 0, policy=5))
+    where = "UAV 0 stops at tick 3 of episode 7: policy 5 gave values that are not finite"
+    with pytest.raises(FlightError, match=where):
+        pilot.advance()
+
+
+def test_a_policy_that_cannot_fly_is_named_where_it_is_refused(world_of: Callable[..., World]) -> None:
+    pilot, _, world = learning(world_of)
+
+    def refuse(_: bytes) -> Any:
+        raise PolicyError("the file is empty: copy it again")
+
+    pilot._make_decider = refuse
+    pilot.begin(begin(world, 7, world.starts(7)[0], policy=5))
+    with pytest.raises(PolicyError, match="UAV 0 cannot fly policy 5: the file is empty"):
+        pilot.on_policy(Policy(5, b""))
 
 
 def test_a_planner_never_explores(team: Callable[..., Team]) -> None:

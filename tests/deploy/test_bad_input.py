@@ -51,7 +51,7 @@ def test_a_policy_file_that_is_none(tmp_path: Path, capsys, monkeypatch) -> None
     monkeypatch.chdir(tmp_path)
     Path("bad.onnx").write_bytes(b"not a model")
     assert main(["fly", "bad.onnx"]) == 2
-    assert "no ONNX model" in capsys.readouterr().err
+    assert "overfly: bad.onnx: the file is text, not an ONNX model" in capsys.readouterr().err
 
 
 def test_a_policy_for_another_grid(tmp_path: Path, capsys, monkeypatch) -> None:

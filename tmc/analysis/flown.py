@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmc.analysis.setting import world_of
+from tmc.kernel.files import read_text
 from tmc.kernel.world import World
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
@@ -110,7 +111,7 @@ def read(folder: Path) -> Flown:
 def _outcome(folder: Path) -> dict[str, Any]:
     """run.json; empty where there is none, or none yet that is whole."""
     try:
-        found = json.loads((folder / "run.json").read_text("utf-8"))
+        found = json.loads(read_text(folder / "run.json"))
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -12,9 +12,9 @@ WIDTH, LINES = 80, 24
 _LABEL = 11
 
 
-def text(s: Summary, pictures: Sequence[Path] = ()) -> str:
-    """The report, without a newline at its end."""
-    paths = list(_paths(s, pictures))
+def text(s: Summary, pictures: Sequence[Path] = (), *, kept: bool = True) -> str:
+    """The report, without a newline at its end. `kept`: the summary is in the run folder too."""
+    paths = list(_paths(s, pictures, kept=kept))
     lines = [*_mission(s), "", *_uncertainty(s), "", *_facts(s)]
     notes = _notes(s, LINES - len(lines) - len(paths))
     return "\n".join([*lines, *notes, *paths])
@@ -114,10 +114,11 @@ def _notes(s: Summary, room: int) -> list[str]:
     return lines if len(lines) <= room else [*lines[: max(room - 1, 0)], f"{indent}and more: see summary.json"]
 
 
-def _paths(s: Summary, pictures: Sequence[Path]) -> Iterator[str]:
+def _paths(s: Summary, pictures: Sequence[Path], *, kept: bool) -> Iterator[str]:
     """Paths stay whole, so that they can be copied, even where they are long."""
     yield f"{'Logs':<{_LABEL}}{s.run}/*.mcap*"
-    yield f"{'Summary':<{_LABEL}}{s.run}/summary.json"
+    if kept:
+        yield f"{'Summary':<{_LABEL}}{s.run}/summary.json"
     if pictures:
         yield f"{'Pictures':<{_LABEL}}{pictures[0].parent}/{{{','.join(sorted(p.name for p in pictures))}}}"
 

@@ -15,6 +15,7 @@ from operator import attrgetter
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tmc.kernel import limits
+from tmc.kernel.files import plain
 
 
 class ConfigError(ValueError):
@@ -249,6 +250,11 @@ def flat(config: Config) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
+def differences(config: Config, other: Config) -> list[str]:
+    """The keys of the settings in which two configs differ, in order."""
+    return [key for key in SETTINGS if get(config, key) != get(other, key)]
+
+
 def build(values: Mapping[str, Any], base: Config | None = None) -> Config:
     """`base` (the paper's config by default) with dotted keys replaced, each converted to its type, all checked."""
     config = base or Config()
@@ -264,7 +270,7 @@ def _setting(key: str) -> Setting:
     last = key.rsplit(".", 1)[-1]
     near = [k for k in SETTINGS if k.rsplit(".", 1)[-1] == last or k.startswith(f"{key}.")]
     hint = f"did you mean {' or '.join(near)}?" if near else "`overfly doctor --settings` lists them"
-    raise ConfigError(f"there is no setting '{key}': {hint}")
+    raise ConfigError(f"there is no setting '{plain(key, 60)}': {hint}")
 
 
 def _replace(config: Config, key: str, value: Any) -> Config:
@@ -280,7 +286,7 @@ def _convert(setting: Setting, value: Any) -> Any:
     try:
         if get_origin(kind) is Literal:
             if value not in get_args(kind):
-                raise ConfigError(f"{key} = {value!r} is none of {', '.join(map(str, get_args(kind)))}")
+                raise ConfigError(f"{key} = {plain(repr(value), 60)} is none of {', '.join(map(str, get_args(kind)))}")
             return value
         if get_origin(kind) is tuple:
             items = value.split(",") if isinstance(value, str) else value
@@ -302,7 +308,7 @@ def _convert(setting: Setting, value: Any) -> Any:
     except (TypeError, ValueError, OverflowError):
         name = getattr(kind, "__name__", str(kind))
         raise ConfigError(
-            f"{key} = {value!r} is not {'a list of int' if name == 'tuple' else f'of type {name}'}"
+            f"{key} = {plain(repr(value), 60)} is not {'a list of int' if name == 'tuple' else f'of type {name}'}"
         ) from None
 
 

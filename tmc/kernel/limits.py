@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
+from tmc.kernel.files import plain
+
 if TYPE_CHECKING:
     from tmc.kernel.config import Config
 
 SIGHTINGS = 1_000_000
-"""Most sightings of a flight record (`tmc.wire.messages.Record`)."""
+"""Most sightings of a flight record; the rule of `tmc.wire.messages.Record` is made of it."""
 
 # (key, lowest, highest): ranges that hold whatever the rest says.
 RANGES: tuple[tuple[str, float, float], ...] = (
@@ -71,7 +73,7 @@ def _complaints(config: Config) -> Iterator[str]:
     for key, low, high in RANGES:
         value = attrgetter(key)(config)
         if not low <= value <= high:
-            yield f"{key} = {value} is out of range: choose {low:,.10g} to {high:,.10g}"
+            yield f"{key} = {plain(value, 60)} is out of range: choose {low:,.10g} to {high:,.10g}"
     near = min(config.team.size, int(2 * config.team.sensing_range + 1) ** 2) - 1
     if near * (min(config.T_u, config.training.ticks) + 1) > SIGHTINGS:
         yield f"a record could hold more than {SIGHTINGS:,} sightings: lower team.sensing_range, or comms.period"
@@ -85,3 +87,56 @@ def _complaints(config: Config) -> Iterator[str]:
         yield "observation.near is larger than observation.radius"
     if config.observation.view == "whole" and config.observation.near:
         yield "observation.near needs observation.view = ego"
+
+
+def learning_starts(config: Config) -> int:
+    """The team's clock, in ticks from the first episode's start on, by which `replay.learn_start` transitions are in.
+
+    A transition is known n ticks later, or at the episode's end, and is in once all UAVs have reported that tick. Where
+    they do so in turn, the clock may be later, since who is ahead depends on who is faster. It may lie after the
+    mission's end.
+    """
+    ticks, team = config.training.ticks, range(config.team.size)
+    whole, rest = divmod(-(-config.replay.learn_start // config.team.size) - 1, ticks)
+    known = min(rest + config.dqn.n_step, ticks)
+    all_in = max(config.next_due(i, known) for i in team)
+    reported = (all_in if all_in == ticks else all_in - (all_in - config.phase(i)) % config.T_u for i in team)
+    return whole * ticks + min(reported)
+
+
+def updates(config: Config) -> int:
+    """The updates that a training makes, as its settings have it; at most, where UAVs exchange in turn."""
+    left = config.training.episodes * config.training.ticks - learning_starts(config)
+    return max(0, int(left * config.replay.updates_per_tick))
+
+
+def idle(config: Config) -> str | None:
+    """Why nothing would be learned in a training with these settings: the reason and the fix; None when it would be."""
+    episodes, replay = config.training.episodes, config.replay
+    total = episodes * config.training.ticks
+    if not replay.updates_per_tick:
+        return "replay.updates_per_tick = 0, so nothing would be learned: raise it, or fly without learning"
+    if not updates(config):
+        made = f"the mission makes {total * config.team.size:,} transitions in {total:,} ticks"
+        start = f"replay.learn_start = {replay.learn_start:,} of them would be in at tick {learning_starts(config):,}"
+        mend = "lower learn_start, raise replay.updates_per_tick, or fly more episodes or ticks"
+        return f"nothing would be learned: {made}, and {start}: {mend}"
+    if config.dqn.target_episodes > episodes and not config.dqn.target_updates:
+        above = f"dqn.target_episodes = {config.dqn.target_episodes:,} is above training.episodes = {episodes:,}"
+        return f"{above}, so the target would never follow: choose {episodes:,} or less, or set dqn.target_updates"
+    return None
+
+
+def remarks(config: Config) -> Iterator[str]:
+    """What a training with these settings will not do, though something is learned; a sentence each."""
+    made, every, target = updates(config), config.training.push_every, config.dqn.target_updates
+    if every > made:
+        yield (
+            f"the training makes {made:,} updates and training.push_every = {every:,}: "
+            "UAVs fly the initial policy to the end, and what is learned is in policies/final.onnx alone"
+        )
+    if target > made and not 0 < config.dqn.target_episodes <= config.training.episodes:
+        yield (
+            f"the training makes {made:,} updates and dqn.target_updates = {target:,}: "
+            "the target network stays as it is at the start"
+        )

@@ -82,6 +82,11 @@ class Observer:
         self._mark(flat[0], cell, cell, EGO)
         return flat.reshape(self.shape)
 
+    @property
+    def first_cell(self) -> int:
+        """A cell that a UAV may look from."""
+        return int(self._monitored[0])
+
     def canvas(self) -> Canvas:
         """An image of its own for one who looks again and again."""
         return Canvas(self, self._monitored if self._whole else None)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields
 
-from tmc.kernel.config import Config, ConfigError, Network
+from tmc.kernel.config import Config, ConfigError, Network, build
+from tmc.kernel.files import plain
 from tmc.kernel.grid import N_ACTIONS, Grid
 
 FORMAT = 1
@@ -17,7 +18,18 @@ N_CHANNELS = 3
 
 
 class PolicyError(ValueError):
-    """A policy that cannot fly here: one sentence with the mend."""
+    """A policy that cannot fly here: one sentence with the fix."""
+
+
+class FlightError(PolicyError):
+    """A policy that failed in flight, which no look at the file could tell."""
+
+
+_RANGES = {
+    "channels": (N_CHANNELS, N_CHANNELS), "height": (1, 65_535), "width": (1, 65_535),
+    "actions": (N_ACTIONS, N_ACTIONS), "scenario": (1, 2), "version": (0, 2**62), "updates": (0, 2**62),
+}  # fmt: skip
+"""What the numbers of a description may be; those that are settings too have the ranges of these."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +54,43 @@ class PolicyCard:
 
     @staticmethod
     def from_json(text: str) -> PolicyCard:
+        """Read a description; raises PolicyError unless every value in it can be."""
+        none = "the file is not an Overfly policy: its description"
         try:
-            card = PolicyCard(**json.loads(text))
-        except (TypeError, ValueError, RecursionError):
-            raise PolicyError("the file is not an Overfly policy: its description cannot be read") from None
-        if any(type(getattr(card, f.name)).__name__ != f.type for f in fields(PolicyCard)):
-            raise PolicyError("the file is not an Overfly policy: its description has values of the wrong type")
-        if card.format != FORMAT:
-            raise PolicyError(f"the policy has format {card.format}, this Overfly reads format {FORMAT}")
+            found = json.loads(text)
+        except (ValueError, RecursionError):
+            raise PolicyError(f"{none} cannot be read, as it is not JSON") from None
+        if not isinstance(found, dict):
+            raise PolicyError(f"{none} cannot be read, as it is not a JSON object")
+        if type(found.get("format")) is int and found["format"] != FORMAT:
+            raise PolicyError(f"the policy has format {plain(found['format'], 40)}, this Overfly reads format {FORMAT}")
+        names = {f.name for f in fields(PolicyCard)}
+        if missing := sorted(names - found.keys() - {"format"}):
+            raise PolicyError(f"{none} lacks {', '.join(missing)}")
+        if unknown := sorted(found.keys() - names):
+            raise PolicyError(f"{none} has the unknown key {plain(unknown[0], 40)!r}")
+        card = PolicyCard(**found)
+        if wrong := card._wrong():
+            raise PolicyError(f"{none} has {wrong}")
         return card
+
+    def _wrong(self) -> str:
+        """The first value that cannot be, and what it may be; empty when there is none."""
+        for f in fields(PolicyCard):
+            value = getattr(self, f.name)
+            if type(value).__name__ != f.type:
+                return f"{f.name} = {plain(repr(value), 40)}, a value of the wrong type: it must be of type {f.type}"
+            if f.name in _RANGES and not _RANGES[f.name][0] <= value <= _RANGES[f.name][1]:
+                low, high = _RANGES[f.name]
+                return f"{plain(value, 40)} {f.name}: it must be {low}" + ("" if low == high else f" to {high}")
+        try:
+            build({"observation.view": self.view, "observation.radius": self.radius, "observation.near": self.near})
+        except ConfigError as error:
+            return f"a view that cannot be ({plain(error, 120)})"
+        side = 2 * self.radius + 1
+        if self.view == "ego" and (self.height, self.width) != (side, side):
+            return f"{self.height} x {self.width} cells, where a radius of {self.radius} has {side} x {side}"
+        return ""
 
 
 def view_shape(config: Config, grid: Grid) -> tuple[int, int, int]:
@@ -100,6 +140,19 @@ def _left_over(network: Network, side: int) -> bool:
     """Whether a convolution sees less than all of what it is given."""
     given = [side, *_sides(network, side)[:-1]]
     return any((n - network.kernel) % network.stride for n in given)
+
+
+def policy_bytes(config: Config, shape: tuple[int, int, int]) -> int:
+    """About how large the policy file of a network is, bytes: its weights, and room for all that names them."""
+    network, (channels, height, width) = config.network, shape
+    rows, cols = features(network, height, width)
+    sizes, before = [], channels
+    for filters in network.channels:
+        sizes.append((before * network.kernel**2 + 1) * filters)
+        before = filters
+    near = (2 * config.observation.near + 1) ** 2 if config.observation.near else 0
+    sizes += [(before * rows * cols + channels * near + 1) * network.dense, (network.dense + 1) * N_ACTIONS]
+    return 4 * sum(sizes) + 1024 * (len(sizes) + 1)
 
 
 def check_view(config: Config, shape: tuple[int, int, int]) -> None:

@@ -2,72 +2,105 @@
 
 name: Old town
 cell_m: 60
-#####
-#.X.#
-#####
+# # # # #
+# . X . #
+# # # # #
+// 3 x 5 cells
+
+Cells stand side by side, or with a blank or a comma between two of them. 0, 1 and 2 stand for free, road and blocked,
+as `overfly map export` writes them. Lines that begin with `//` are not read.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterable
+
+from tmc.kernel.files import plain
 
 FREE, ROAD, BLOCKED = ".", "#", "X"
+CELLS = {FREE: FREE, ROAD: ROAD, BLOCKED: BLOCKED, "0": FREE, "1": ROAD, "2": BLOCKED}
+"""What may stand for a cell, and the sign that it means."""
+COMMENT = "//"
 HEADER_KEYS = ("name", "cell_m", "attribution")
+CELL_M = (0.01, 100_000.0)
+"""Least and largest width of a cell, metres: none that is flown over lies outside."""
 
 
 class MapError(ValueError):
-    """A road map that cannot be used: the message says what was wrong, where, and the mend, in one sentence."""
+    """A road map that cannot be used: the message says what was wrong, where, and the fix, in one sentence."""
 
 
 def parse_text(text: str, where: str) -> tuple[dict[str, str], list[str]]:
     """The header and the rows of a raster: at least one row, all equally long, 65,535 cells at most.
 
-    Blank lines may surround the header and end the text. `where` is what messages call the text. Raises MapError.
+    Rows come in FREE, ROAD and BLOCKED without anything between. Blank lines may surround the header and end the text.
+    `where` is what messages call the text. Raises MapError.
     """
-    lines = [line.rstrip() for line in text.rstrip().splitlines()]
-    first = next((i for i, line in enumerate(lines) if line and ":" not in line), len(lines))
-    header, rows = _header(lines[:first], where), lines[first:]
-    if not rows:
+    numbered = [(number, line.rstrip()) for number, line in enumerate(text.splitlines(), 1)]
+    lines = [(number, line) for number, line in numbered if not line.startswith(COMMENT)]
+    while lines and not lines[-1][1]:
+        lines.pop()
+    first = next((i for i, (_, line) in enumerate(lines) if line and ":" not in line), len(lines))
+    header = _header(lines[:first], where)
+    if first == len(lines):
         raise MapError(f"{where} has no raster row: write a line a row in # (road), . (free) and X (blocked)")
-    _check_rows(rows, first, where)
-    return header, rows
+    return header, _rows(lines[first:], where)
 
 
-def _header(lines: list[str], where: str) -> dict[str, str]:
+def raster_text(header: dict[str, str], rows: Iterable[str], notes: Iterable[str] = ()) -> str:
+    """The text that `parse_text` reads; `notes` stand behind the rows, as comments."""
+    lines = [f"{key}: {value}" for key, value in header.items()]
+    return "\n".join([*lines, *([""] if lines else []), *rows, *([""] if notes else []),
+                      *(f"{COMMENT} {note}" for note in notes), ""])  # fmt: skip
+
+
+def _header(lines: list[tuple[int, str]], where: str) -> dict[str, str]:
     header: dict[str, str] = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in lines:
         key, colon, value = (part.strip() for part in line.partition(":"))
         if colon and key not in HEADER_KEYS:
-            raise MapError(f"{where}: line {number} has the unknown key '{key}': use {', '.join(HEADER_KEYS)}")
+            raise MapError(f"{where}: line {number} has the unknown key {key[:40]!r}: use {', '.join(HEADER_KEYS)}")
         if key in header:
             raise MapError(f"{where}: line {number} gives '{key}' a second time: keep one")
         if key == "cell_m":
             _check_cell_m(value, f"{where}: line {number}")
         if colon:
-            header[key] = value
+            header[key] = plain(value, 1000)
     return header
 
 
 def _check_cell_m(value: str, where: str) -> None:
     try:
-        good = 0 < float(value) < math.inf
+        good = CELL_M[0] <= float(value) <= CELL_M[1]
     except ValueError:
         good = False
     if not good:
-        raise MapError(f"{where}: cell_m is '{value}': give the width of a cell in metres, such as 60")
+        mend = f"give the width of a cell in metres, such as 60, from {CELL_M[0]:g} to {CELL_M[1]:,.0f}"
+        raise MapError(f"{where}: cell_m is '{value[:40]}': {mend}")
 
 
-def _check_rows(rows: list[str], first: int, where: str) -> None:
-    width = len(rows[0])
-    for number, row in enumerate(rows, first + 1):
-        for column, character in enumerate(row, 1):
-            if character not in (FREE, ROAD, BLOCKED):
-                raise MapError(
-                    f"{where}: line {number}, column {column} is {character!r}: use # (road), . (free) or X (blocked)"
-                )
-        if len(row) != width:
+def _rows(lines: list[tuple[int, str]], where: str) -> list[str]:
+    rows: list[str] = []
+    for number, line in lines:
+        row = ""
+        for column, sign in enumerate(_signs(line), 1):
+            if sign not in CELLS:
+                known = "# (road), . (free) or X (blocked)"
+                raise MapError(f"{where}: line {number}, column {column} is {sign[:40]!r}: use {known}")
+            row += CELLS[sign]
+        if rows and len(row) != len(rows[0]):
+            width = len(rows[0])
             raise MapError(
                 f"{where}: line {number} has {len(row)} cells and the first row {width}: make all rows alike"
             )
-    if len(rows) * width > 65_535:
-        raise MapError(f"{where} has {len(rows)} x {width} cells, over 65,535 of them: make the cells wider")
+        rows.append(row)
+    if len(rows) * len(rows[0]) > 65_535:
+        raise MapError(f"{where} has {len(rows)} x {len(rows[0])} cells, over 65,535 of them: make the cells wider")
+    return rows
+
+
+def _signs(line: str) -> list[str]:
+    """What stands for each cell of a row."""
+    if "," in line:
+        return [part.strip() for part in line.split(",")]
+    return line.split(" ") if " " in line else list(line)

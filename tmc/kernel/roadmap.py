@@ -1,13 +1,12 @@
 """The road map that all parties agree on (Sec. II): which cells are road, which are closed, and how busy each one is.
 
-Reading the built-in maps (`maps/*.json`, package data) and a user's text raster is the only I/O of the kernel.
+Reading the built-in maps (`maps/*.json`, package data) and a user's text raster is all that the kernel reads.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
@@ -17,11 +16,13 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tmc.kernel import files as regular
 from tmc.kernel.grid import OFF_GRID, STAY, Grid
 from tmc.kernel.raster import UNREACHABLE, Georeference, components, flood
-from tmc.kernel.rastertext import BLOCKED, FREE, ROAD, MapError, parse_text
+from tmc.kernel.rastertext import BLOCKED, CELL_M, FREE, ROAD, MapError, parse_text, raster_text
 
 __all__ = [
+    "COPY",
     "OBSTACLES",
     "ROADS",
     "UNREACHABLE",
@@ -31,13 +32,16 @@ __all__ = [
     "builtin_maps",
     "check",
     "load_map",
+    "map_of_run",
     "parse_raster",
 ]
 
 ROADS = ("major", "main", "arterial", "all")
 OBSTACLES = ("none", "static", "event-day")
-CELL_M = 60.0
+USUAL_CELL_M = 60.0
 """The width of a cell, metres, where a text raster names none: the built-in map's."""
+COPY = "map.txt"
+"""The copy of a user's map in the run folder, so that the folder is enough to go on with the run, wherever it lies."""
 Scalar = TypeVar("Scalar", bound=np.generic)
 MAX_BYTES = 2**18  # 65,535 one-cell rows with CRLF need 196,605 bytes; the rest is room for a header
 
@@ -57,7 +61,8 @@ class RoadMap:
 
     `road`, `blocked`: shape (K,). `blocked` holds static obstacles and no-fly cells. `cell_m`: metres.
     `rates`: name -> shape (K,), relative, mean 1 over the road cells and 0 elsewhere; "uniform" is always there.
-    `streets`: those that the preset turned into road; empty for a user's raster.
+    `streets`: those that the preset turned into road; empty for a user's raster. `source`: the text of a user's raster,
+    with its name, whatever is left out of the map; empty for a built-in map.
 
     Raises MapError when the arrays disagree.
     """
@@ -71,6 +76,7 @@ class RoadMap:
     streets: tuple[Street, ...] = ()
     attribution: str = ""
     georeference: Georeference | None = None
+    source: str = ""
 
     def __post_init__(self) -> None:
         rates = {"uniform": self.road.astype(np.float64), **self.rates}
@@ -80,8 +86,9 @@ class RoadMap:
             raise MapError(f"map '{self.name}' has no road cell, so there is nothing to patrol: mark some as road")
         if (self.road & self.blocked).any():
             raise MapError(f"map '{self.name}' has cells that are road and blocked: choose one for each")
-        if not (math.isfinite(self.cell_m) and self.cell_m > 0):
-            raise MapError(f"map '{self.name}' has cells of {self.cell_m} m: give a width above 0")
+        if not CELL_M[0] <= self.cell_m <= CELL_M[1]:
+            mend = f"give a width from {CELL_M[0]:g} to {CELL_M[1]:,.0f}"
+            raise MapError(f"map '{self.name}' has cells of {self.cell_m:g} m: {mend}")
         object.__setattr__(self, "road", _frozen(self.road))
         object.__setattr__(self, "blocked", _frozen(self.blocked))
         object.__setattr__(self, "rates", {name: _frozen(rate) for name, rate in rates.items()})
@@ -151,28 +158,33 @@ def load_map(name: str, roads: str = "main", obstacles: str = "static") -> RoadM
     return parse_raster(_read(name), Path(name).stem, name, keep_blocked=obstacles != "none")
 
 
+def map_of_run(folder: Path, name: str, roads: str, obstacles: str) -> RoadMap:
+    """As `load_map`, for a run in `folder`: its own copy of a user's map wins, whatever became of the file."""
+    copy = folder / COPY
+    own = name not in builtin_maps() and copy.exists()
+    return load_map(str(copy) if own else name, roads, obstacles)
+
+
 def _choice(setting: str, value: str, known: tuple[str, ...]) -> None:
     if value not in known:
         raise MapError(f"{setting} = '{value}' is not known: use one of {', '.join(known)}")
 
 
 def _read(path: str) -> str:
-    if Path(path).is_fifo():
-        raise MapError(f"{path} is a pipe: give the path of a text raster")
+    shown = regular.plain(path)
     try:
-        with Path(path).open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
+        raw = regular.read_bytes(path, MAX_BYTES + 1)
         text = raw.decode("utf-8-sig")
     except FileNotFoundError:
         known = ", ".join(builtin_maps())
-        raise MapError(f"no map and no file is called '{path}': use {known}, or the path of a text raster") from None
+        raise MapError(f"no map and no file is called '{shown}': use {known}, or the path of a text raster") from None
     except UnicodeDecodeError as error:
-        raise MapError(f"{path}: byte {error.start + 1} is not UTF-8: save the raster as plain text") from None
-    except (OSError, ValueError) as error:  # a folder, no permission, a name that no file can have
+        raise MapError(f"{shown}: byte {error.start + 1} is not UTF-8: save the raster as plain text") from None
+    except (OSError, ValueError) as error:  # a folder, a pipe, no permission, a name that no file can have
         reason = getattr(error, "strerror", None) or error
-        raise MapError(f"{path!r} cannot be read ({reason}): give the path of a readable text file") from None
+        raise MapError(f"'{shown}' cannot be read ({reason}): give the path of a readable text file") from None
     if len(raw) > MAX_BYTES:
-        raise MapError(f"{path} is over {MAX_BYTES:,} bytes, too much for 65,535 cells: make the cells wider")
+        raise MapError(f"{shown} is over {MAX_BYTES:,} bytes, too much for 65,535 cells: make the cells wider")
     return text
 
 
@@ -181,17 +193,21 @@ def parse_raster(text: str, name: str = "raster", where: str = "raster", *, keep
 
     `name` is used when no header gives one; `where` is what messages call the text.
     """
+    where = regular.plain(where)
     header, rows = parse_text(text, where)
+    header = {"name": "", **header}
+    header["name"] = header["name"] or regular.plain(name) or "raster"
     cells = np.array([list(row) for row in rows]).ravel()
     if not (cells == ROAD).any():
         raise MapError(f"{where} has no road cell in its {len(rows)} rows: mark road cells with #")
     return RoadMap(
-        name=header.get("name") or name,
+        name=header["name"],
         grid=Grid(len(rows), len(rows[0])),
-        cell_m=float(header.get("cell_m", CELL_M)),
+        cell_m=float(header.get("cell_m", USUAL_CELL_M)),
         road=cells == ROAD,
         blocked=(cells == BLOCKED) & keep_blocked,
         attribution=header.get("attribution", ""),
+        source=raster_text(header, rows),
     )
 
 

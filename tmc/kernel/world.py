@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from tmc.kernel.config import Config, ConfigError
 from tmc.kernel.draws import Stream, distinct, uniforms
 from tmc.kernel.grid import OFF_GRID
 from tmc.kernel.reward import Block
-from tmc.kernel.roadmap import RoadMap, load_map
+from tmc.kernel.roadmap import RoadMap, load_map, map_of_run
 from tmc.kernel.uncertainty import UncertaintyLaw, arrival_probability
 
 
@@ -100,3 +101,9 @@ class World:
         ticks = self.config.training.ticks
         u = uniforms(self.config.training.seed, Stream.EXPLORATION, 2 * ticks, episode=episode, uav=uav)
         return u.reshape(ticks, 2)
+
+
+def world_of_run(config: Config, folder: Path) -> World:
+    """The world of a run in `folder`, with the map that lies there, where a user's map was flown over."""
+    world = config.world
+    return World(config, map_of_run(folder, world.map, world.roads, world.obstacles))

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import IO, Any
 
+from tmc.kernel import files
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 
@@ -30,6 +31,8 @@ def left_behind(path: Path, resume: bool) -> Path | None:
 
 def open_held(path: Path, mode: str) -> Any:
     """Open a log and keep other writers away from it until it is closed; RecordError when one has it already."""
+    if mode == "rb":
+        files.check(path)
     file: IO[bytes] = open(path, mode, opener=_whole)  # noqa: SIM115  whoever asked for it closes it
     try:
         _hold(file, path)
@@ -78,12 +81,17 @@ def sync_folder(folder: Path) -> None:
 def put(path: Path, content: bytes, *, sync: bool) -> None:
     """Write a file whole or not at all; with `sync`, wait until the disk has it."""
     new = path.with_suffix(".new")
-    with new.open("wb") as file:
-        file.write(content)
-        if sync:
-            file.flush()
-            os.fsync(file.fileno())
-    new.replace(path)
+    new.unlink(missing_ok=True)
+    try:
+        with new.open("xb") as file:
+            file.write(content)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        new.replace(path)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
     if sync:
         sync_folder(path.parent)
 

@@ -15,6 +15,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
+from tmc.kernel import files
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.frames import MAGIC, RECOVERED, DamageError, Raw, contents
@@ -132,11 +133,8 @@ class Log:
 
 
 def _check_start(path: Path) -> None:
-    if path.is_fifo():
-        raise RecordError(f"{path} is a pipe: give the file of a log")
     try:
-        with path.open("rb") as file:
-            start = file.read(len(MAGIC))
+        start = files.read_bytes(path, len(MAGIC))
     except OSError as error:
         raise RecordError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
     if not start:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from deploy.progress import Progress
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas
+from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
 SMALL = {
@@ -45,13 +45,25 @@ def fly(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     return make
 
 
+def flown_as(old: Path, new: Path, change: dict[str, object]) -> None:
+    """A copy of a run with settings changed, in the log and in a `config.json` beside it."""
+    new.mkdir()
+    was = Log(old / "tmc.mcap")
+    config = next(json.loads(a.data) for a in was.attachments() if a.name == "config.json")
+    text = json.dumps(config | change)
+    (new / "config.json").write_text(text)
+    with LogWriter(new / "tmc.mcap", "tmc", Journal(), was.metadata()) as log:
+        for a in was.attachments():
+            log.attach(a.name, a.media_type, text.encode() if a.name == "config.json" else a.data)
+        for raw in was.raw():
+            log.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
+
+
 @pytest.fixture(scope="session")
 def learned(fly: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that looks like training, without torch: three random episodes, and the log of a learner."""
     folder = tmp_path_factory.mktemp("learned") / "run"
-    shutil.copytree(fly(**{"training.episodes": 3}), folder)
-    config = json.loads((folder / "config.json").read_text()) | {"team.pilot": "policy"}
-    (folder / "config.json").write_text(json.dumps(config))
+    flown_as(fly(**{"training.episodes": 3}), folder, {"team.pilot": "policy"})
     with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
         for n in range(1, 181):
             metrics = schemas.LearnerMetrics(updates=n, loss=1 / n, q_mean=n / 20, target_mean=n / 19)

@@ -9,10 +9,12 @@ import pytest
 
 from deploy import cli
 from deploy.lockstep import LockStep
+from tests.tmc.analysis.conftest import flown_as
 from tmc.analysis.flown import read
 from tmc.analysis.metrics import event_waits, summarize, summary
 from tmc.journal import Journal as TmcJournal
 from tmc.kernel.config import Journal, build, flat
+from tmc.kernel.roadmap import load_map
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
 from tmc.record import facts, schemas
@@ -244,12 +246,35 @@ def test_without_config_json_the_log_has_it(fly, tmp_path):
         read(folder)
 
 
-def test_a_config_of_another_run_is_refused(fly, tmp_path):
+def test_a_log_that_does_not_fit_its_settings_is_refused(fly, tmp_path):
+    flown_as(fly(), tmp_path / "R", {"team.size": 2})
+    with pytest.raises(RecordError, match="does not fit its config of 2 UAVs"):
+        read(tmp_path / "R")
+
+
+def test_the_settings_in_the_log_count_and_the_edited_ones_are_named(fly, tmp_path):
     folder = copy_of(fly(), tmp_path)
     config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps(config | {"team.size": 2}))
-    with pytest.raises(RecordError, match="does not fit its config of 2 UAVs"):
-        read(folder)
+    (folder / "config.json").write_text(json.dumps(config | {"team.size": 2, "training.seed": 99}))
+    s = summary(folder)
+    assert (s.mission.uavs, s.mission.seed, s.episodes) == (3, 3, summary(fly()).episodes)
+    note = "config.json: team.size, training.seed changed since the run, the log's settings are used"
+    assert list(s.health.notes) == [note]
+    (folder / "config.json").write_text(json.dumps({k: v for k, v in config.items() if k != "training.seed"}))
+    assert "config.json: training.seed changed" in summary(folder).health.notes[0]
+
+
+def test_the_copy_of_the_map_in_the_run_folder_counts(fly, tmp_path):
+    raster = tmp_path / "town.txt"
+    raster.write_text("name: Old town\ncell_m: 25\n#########\n#.......#\n#########\n")
+    folder = copy_of(fly(**{"world.map": str(raster)}), tmp_path / "moved")
+    (folder / "map.txt").write_text(load_map(str(raster)).source)
+    raster.unlink()
+    s = summary(folder)
+    assert (s.mission.map, s.mission.cell_m, s.health.notes) == ("Old town", 25.0, ())
+    (folder / "map.txt").write_text("#########\n#...X...#\n#########\n")
+    assert "map map.txt: changed since the run, the log's is used" in summary(folder).health.notes
+    assert summary(folder).episodes == s.episodes
 
 
 def test_what_is_no_run_is_refused(tmp_path, fly):

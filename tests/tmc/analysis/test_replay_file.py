@@ -25,6 +25,7 @@ from actors.pilot import Pilot
 from deploy import cli
 from deploy.lockstep import LockStep
 from tests.command import PATIENCE
+from tests.tmc.analysis.conftest import flown_as
 from tmc.analysis import palette, replayfile
 from tmc.analysis.replayfile import TICK_NS, TRAIL, place
 from tmc.journal import Journal
@@ -420,11 +421,10 @@ def test_the_command(together: Flown, tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_log_that_does_not_fit_its_config_is_refused(together: Flown, tmp_path: Path) -> None:
-    (tmp_path / "tmc.mcap").write_bytes((together.folder / "tmc.mcap").read_bytes())
     for key, value in (("team.size", 2), ("training.ticks", 30)):
-        (tmp_path / "config.json").write_text(json.dumps({**BASE, key: value}))
+        flown_as(together.folder, tmp_path / key, {key: value})
         with pytest.raises(RecordError, match="the log does not fit its config"):
-            replayfile.write(tmp_path, 1, tmp_path / "out.mcap")
+            replayfile.write(tmp_path / key, 1, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
 

@@ -261,6 +261,33 @@ def test_a_file_with_a_header(tmp_path: Path) -> None:
     assert load_map(str(path), obstacles="event-day").blocked.sum() == 1
 
 
+@given(cells, st.sampled_from([" ", ",", ", "]), st.booleans())
+def test_cells_may_stand_apart_and_as_numbers(rows: list[str], between: str, numbers: bool) -> None:
+    signs = str.maketrans(".#X", "012") if numbers else {}
+    text = "\n".join(between.join(row.translate(signs)) for row in rows)
+    assert parse_raster("// a note\n" + text + "\n\n// another: one\n").text().splitlines() == rows
+
+
+@given(cells)
+def test_the_source_of_a_map_is_the_map(rows: list[str]) -> None:
+    header = "name: Town: the old one\ncell_m: 12.125\nattribution: me\n"
+    m = parse_raster(header + "\n".join(rows), keep_blocked=False)
+    again = parse_raster(m.source, "another")
+    assert (again.name, again.cell_m, again.attribution) == ("Town: the old one", 12.125, "me")
+    assert again.text().splitlines() == rows and again.source == m.source
+    assert parse_raster("\n".join(rows), "village").source.startswith("name: village\n")
+
+
+def test_a_name_is_one_line_of_plain_text(tmp_path: Path) -> None:
+    assert parse_raster("name: \x1b[31mred\u202e\n#").name == "[31mred"
+    path = tmp_path / "a\x1b[2Jb\n.txt"
+    path.write_text("#\n")
+    assert load_map(str(path)).name == "a [2Jb"
+    with pytest.raises(MapError) as refusal:
+        load_map(str(path) + "\n")
+    assert "\x1b" not in str(refusal.value) and "\n" not in str(refusal.value)
+
+
 def test_a_file_without_a_header_is_called_after_itself(tmp_path: Path) -> None:
     path = tmp_path / "village.txt"
     path.write_text("#.\n")
@@ -283,9 +310,22 @@ def test_the_largest_map_and_one_row_more() -> None:
         ("name: a\n\n###\n##\n", "line 4 has 2 cells and the first row 3: make all rows alike"),
         ("##\n\n##\n", "line 2 has 0 cells and the first row 2: make all rows alike"),
         ("###\n#o#\n", r"line 2, column 2 is 'o': use # \(road\), . \(free\) or X \(blocked\)"),
-        ("0,1\n1,1\n", "line 1, column 1 is '0': use #"),
-        ("##\nname: late\n", "line 2, column 1 is 'n': use #"),
+        ("0,1\n1,3\n", "line 2, column 2 is '3': use #"),
+        ("0,1\n1,,1\n", "line 2, column 2 is '': use #"),
+        ("0,1\n1,1,\n", "line 2, column 3 is '': use #"),
+        ("# #\n#  #\n", "line 2, column 2 is '': use #"),
+        ("0,1\n1\n", "line 2 has 1 cells and the first row 2: make all rows alike"),
+        ("// only words\n", "has no raster row: write a line a row"),
+        ("##\n//\n\n##\n", "line 3 has 0 cells and the first row 2: make all rows alike"),
+        ("##\nname: late\n", "line 2, column 1 is 'name:': use #"),
         ("metres: 60\n##\n", "line 1 has the unknown key 'metres': use name, cell_m, attribution"),
+        ("// a note\n\ncell_m: wide\n##\n", "line 3: cell_m is 'wide': give"),
+        ("cell_m: true\n##\n", "cell_m is 'true': give"),
+        ("cell_m:\n##\n", "cell_m is '': give"),
+        ("cell_m: -60\n##\n", "cell_m is '-60': give"),
+        ("cell_m: 1e308\n##\n", "cell_m is '1e308': give .* from 0.01 to 100,000"),
+        ("cell_m: 1e-300\n##\n", "cell_m is '1e-300': give"),
+        ("cell_m: 1e999\n##\n", "cell_m is '1e999': give"),
         ("name: a\nname: b\n##\n", "line 2 gives 'name' a second time: keep one"),
         ("cell_m: wide\n##\n", "line 1: cell_m is 'wide': give the width of a cell in metres, such as 60"),
         ("cell_m: 0\n##\n", "cell_m is '0': give"),
@@ -342,8 +382,9 @@ def test_a_map_refuses_arrays_that_disagree() -> None:
         RoadMap("m", grid, 60.0, free, free)
     with pytest.raises(MapError, match="has an array without one value a cell: give 2 in each"):
         RoadMap("m", grid, 60.0, road, free[:1])
-    with pytest.raises(MapError, match="has cells of 0 m"):
-        RoadMap("m", grid, 0, road, free)
+    for width in (0, -1.0, 1e308, float("nan"), float("inf")):
+        with pytest.raises(MapError, match=r"has cells of .* m: give a width from"):
+            RoadMap("m", grid, width, road, free)
 
 
 # The raster rule
