@@ -5,16 +5,32 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 from pathlib import Path
 from typing import IO, Any
 
 from tmc.record.channels import ACTIVE
-from tmc.record.errors import RecordError
+from tmc.record.errors import NoLogError, RecordError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a disk that holds no more."""
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
 """Errors of a file system that knows no locks, or, as NFS, none of files opened to read: there, nothing is held."""
+
+
+_KINDS = {stat.S_IFIFO: "pipe", stat.S_IFSOCK: "socket", stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
+"""What may go by the name of a file without being one."""
+
+
+def open_log(path: Path) -> IO[bytes]:
+    """Open a log to read. NoLogError where that is not possible, or would wait for ever as a pipe's end does."""
+    try:
+        kind = _KINDS.get(stat.S_IFMT(path.stat().st_mode))  # before it is opened: that alone may do something
+        if kind is None:
+            return path.open("rb")
+    except OSError as error:
+        raise NoLogError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
+    raise NoLogError(f"{path} is a {kind}: give the file of a log")
 
 
 def left_behind(path: Path, resume: bool) -> Path | None:
@@ -30,7 +46,7 @@ def left_behind(path: Path, resume: bool) -> Path | None:
 
 def open_held(path: Path, mode: str) -> Any:
     """Open a log and keep other writers away from it until it is closed; RecordError when one has it already."""
-    file: IO[bytes] = open(path, mode, opener=_whole)  # noqa: SIM115  whoever asked for it closes it
+    file = open_log(path) if mode == "rb" else open(path, mode, opener=_whole)  # noqa: SIM115  whoever asks closes it
     try:
         _hold(file, path)
         if mode == "wb":
@@ -42,8 +58,8 @@ def open_held(path: Path, mode: str) -> Any:
 
 
 def _whole(name: str, flags: int) -> int:
-    """Opens without cutting the file: it may be somebody else's."""
-    return os.open(name, flags & ~os.O_TRUNC, 0o666)
+    """Opens without cutting the file, which may be somebody else's, and without waiting for who reads a pipe."""
+    return os.open(name, flags & ~os.O_TRUNC | os.O_NONBLOCK, 0o666)
 
 
 def _hold(file: IO[bytes], path: Path) -> None:
