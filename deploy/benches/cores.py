@@ -31,7 +31,7 @@ def worth() -> float | None:
         subprocess.Popen([*command, str(int(alone))], env=env, stdout=subprocess.PIPE, text=True)
         for alone in (True, *(False,) * (core_count() - 1))
     ]
-    counts: list[list[int] | None] = [json.loads(child.communicate()[0]) for child in children]
+    counts: list[list[int] | None] = [json.loads(child.communicate()[0] or "null") for child in children]
     there = [count for count in counts if count is not None]
     if len(there) < len(counts):
         return None

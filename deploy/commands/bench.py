@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import signal
+import subprocess
 import sys
 from dataclasses import asdict, dataclass
 
@@ -55,6 +57,11 @@ def main(args: argparse.Namespace) -> int:
         rows = bench.measure(args)
     except MissionFailed as failed:
         print(f"overfly: {failed}", file=sys.stderr)
+        return FAILED
+    except subprocess.CalledProcessError as failed:  # what it had to say stands above
+        code = failed.returncode
+        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        print(f"overfly: a process that was measured {how}", file=sys.stderr)
         return FAILED
     facts["cores_worth"] = [before, cores.worth()]
     if args.json:
