@@ -14,9 +14,6 @@ from types import FrameType
 
 from tmc.wire import process
 
-LEARNERS_OWN = ("torch", "safetensors")
-"""Packages that only a learner needs."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -94,6 +91,19 @@ def check_install() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    try:
+        return _main(argv)
+    except Exception as error:
+        from deploy import extras  # noqa: PLC0415  only where something is wrong
+
+        sentence = extras.broken(error)
+        if not sentence:
+            raise
+        print(f"overfly: {sentence}", file=sys.stderr)
+        return process.USAGE
+
+
+def _main(argv: list[str] | None) -> int:
     # While modules are imported nothing is worth an orderly end: Ctrl-C ends the process, without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     argv = sys.argv[1:] if argv is None else argv
@@ -115,13 +125,11 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough; we are not done, though
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in LEARNERS_OWN:
-            raise
-        mend = "in the folder of Overfly, run pip install '.[learner]'"
-        print(f"overfly: {error.name} is not installed, and a learner needs it: {mend}", file=sys.stderr)
-        return process.USAGE
     except OSError as error:  # a full disk, a folder that was removed
+        from deploy import extras  # noqa: PLC0415  only where something is wrong
+
+        if extras.broken(error):  # a library without another one that it needs
+            raise
         print(f"overfly: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return process.FAILED
 

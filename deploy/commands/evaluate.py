@@ -15,7 +15,7 @@ from multiprocessing import get_context
 from statistics import mean, stdev
 from typing import Any
 
-from deploy import lockstep, settings, who
+from deploy import extras, lockstep, settings, who
 from deploy.mission import bound_of, check
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.world import World
@@ -74,6 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Fly them all, then print the table."""
+    extras.require()
     if args.seeds < 1 or args.jobs < 1:
         raise ConfigError("--seeds and --jobs must be 1 or more")
     if args.seed is not None or args.episodes is not None:

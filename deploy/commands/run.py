@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from deploy import mission, settings
+from deploy import extras, mission, settings
 from deploy.commands.analyze import report
 from tmc.kernel.config import ConfigError
 
@@ -33,6 +33,7 @@ def main(args: argparse.Namespace) -> int:
     if args.preset is None:
         raise ConfigError(f"which preset? choose {', '.join(settings.preset_names())}, or --resume RUN")
     config = settings.config_for(args.preset, settings.chosen(args))
+    extras.require(*mission.needs(config, None))
     world = mission.check(config)
     out = mission.new_folder(args.out, args.preset)
     code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
@@ -48,5 +49,6 @@ def resume(args: argparse.Namespace) -> int:
     if mission.finished(args.resume):
         return report(args.resume, as_json=args.json, pictures=not args.no_pictures)
     world, policy = mission.interrupted(args.resume)
+    extras.require(*mission.needs(world.config, policy))
     code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)
     return code or report(args.resume, as_json=args.json, pictures=not args.no_pictures)

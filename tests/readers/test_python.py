@@ -15,7 +15,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from tests.readers.conftest import Topic
 from tmc.record.reader import Log
 
-MISSING = "needs pybag-sdk: pip install 'overfly[readers]'"
+MISSING = "needs pybag-sdk: pip install '.[readers]'"
 
 
 def message_class(schema: Any) -> Any:

@@ -18,7 +18,7 @@ from tests.readers.conftest import Topic
 
 Rerun = Callable[..., subprocess.CompletedProcess[str]]
 
-MISSING = "needs rerun-sdk: pip install 'overfly[readers]'"
+MISSING = "needs rerun-sdk: pip install '.[readers]'"
 
 
 @pytest.fixture
