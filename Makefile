@@ -1,4 +1,4 @@
-# Everything that a fresh machine needs is installed by the first target that needs it, into .venv.
+# Everything that a fresh machine needs is installed by the first target that needs it, into .venv: Python 3.11 to 3.13.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -33,7 +33,7 @@ $(VENV)/bin/pip:
 # later resolution can choose another build of it.
 $(VENV)/.run: pyproject.toml constraints.txt | $(VENV)/bin/pip
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[learner,figures]"
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[all]"
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.run

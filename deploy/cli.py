@@ -15,9 +15,6 @@ from types import FrameType
 
 from tmc.wire import process
 
-LEARNERS_OWN = ("torch", "safetensors")
-"""Packages that only a learner needs."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -103,6 +100,19 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     process.standard_streams()
     process.inherited_signals()
+    try:
+        return _main(argv)
+    except Exception as error:
+        from deploy import extras  # noqa: PLC0415  only where something is wrong
+
+        sentence = extras.broken(error)
+        if not sentence:
+            raise
+        process.tell(sentence)
+        return process.USAGE
+
+
+def _main(argv: list[str] | None) -> int:
     # While modules are imported nothing is worth an orderly end: Ctrl-C ends the process, without a traceback.
     process.handle(signal.SIGINT, signal.SIG_DFL)
     argv = sys.argv[1:] if argv is None else argv
@@ -125,13 +135,11 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output, such as `head`, has seen enough; we are not done, though
         discard_output()
         return 128 + signal.SIGPIPE
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in LEARNERS_OWN:
-            raise
-        mend = "in the folder of Overfly, run pip install '.[learner]'"
-        process.tell(f"{error.name} is not installed, and a learner needs it: {mend}")
-        return process.USAGE
     except OSError as error:  # a full disk, a folder that was removed
+        from deploy import extras  # noqa: PLC0415  only where something is wrong
+
+        if extras.broken(error):  # a library without another one that it needs
+            raise
         discard_output()
         process.tell(f"{error.filename or 'output'}: {error.strerror or error}")
         return process.FAILED

@@ -20,10 +20,12 @@ import select
 import signal
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from deploy import extras
 from tmc.wire import process
 
 TITLE = ("python", "-P", "-m")
@@ -161,6 +163,24 @@ def _do_without(a: argparse.Namespace) -> None:
         os.execv(sys.executable, [*line, f"--parent={a.parent}", f"--room={a.room}"])
 
 
+def _program(package: str, preload: Sequence[str]) -> Main:
+    """What the processes run; where something cannot be imported, each says so in a sentence, and is not restarted."""
+    try:
+        run: Main = importlib.import_module(f"{package}.__main__").main
+        for module in preload:
+            importlib.import_module(module)
+    except Exception as error:
+        sentence = extras.broken(error)
+        if not sentence:
+            raise
+        return lambda _: process.run(partial(_refuse, sentence), (RuntimeError,))
+    return run
+
+
+def _refuse(sentence: str) -> int:
+    raise RuntimeError(sentence)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Import, freeze, serve."""
     parser = argparse.ArgumentParser("deploy.forkserver", description=__doc__)
@@ -172,15 +192,13 @@ def main(argv: list[str] | None = None) -> int:
     a = parser.parse_args(argv)
     process.become_child(a.parent)
     set_title((*TITLE, "deploy.forkserver", "--of", a.of, "--out", a.out, "--parent", str(a.parent)))
-    program = importlib.import_module(f"{a.of}.__main__")
-    for module in a.preload:
-        importlib.import_module(module)
+    run = _program(a.of, a.preload)
     if process.threads() > 1:
         _do_without(a)
     gc.collect()
     gc.freeze()  # what is here now is never collected, so a collection in a process does not copy its pages
     with contextlib.suppress(BrokenPipeError):
-        ForkServer(a.of, program.main).serve()
+        ForkServer(a.of, run).serve()
     return process.DONE
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
 from actors.tracks import create_table
-from deploy import lockstep, plan, who
+from deploy import extras, lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
 from tmc.analysis.setting import attachments, settings_of
@@ -94,6 +94,11 @@ def check_training(config: Config) -> None:
         raise ConfigError(idle)
     for sentence in limits.remarks(config):
         print(f"overfly: {sentence}", file=sys.stderr)
+
+
+def needs(config: Config, policy: bytes | None) -> tuple[str, ...]:
+    """The extras that a mission on this machine needs: only one without a fixed policy or a planner has a learner."""
+    return () if policy is not None or who.is_planner(config) else (extras.LEARNER,)
 
 
 def flown_policy(out: Path) -> Path:

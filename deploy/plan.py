@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import importlib.util
 import os
 import shutil
 import sys
@@ -70,8 +69,6 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
     children = [Child("tmc", tuple(tmc), restart=True, leads=True)]
     common = ("--connect", endpoint, "--out", str(out))
     if not flies_fixed:
-        if importlib.util.find_spec("torch") is None:  # or the learner would say so, again and again
-            raise ModuleNotFoundError("torch is not installed", name="torch")
         children.append(Child("learner", common, restart=True, fork_of="learner"))
     for i in range(config.team.size):
         children.append(Child(f"uav-{i:03d}", ("--id", str(i), *common), restart=True, fork_of="actors"))

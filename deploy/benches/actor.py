@@ -17,9 +17,9 @@ from actors.fleet import Fleet
 from actors.pilot import Pilot
 from actors.tracks import TableTracks, TrackTable
 from deploy import settings, who
+from deploy.benches import bounds
 from deploy.benches.row import Row
 from deploy.mission import check
-from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import Observer
 from tmc.kernel.policy import INPUT, OUTPUT
 from tmc.kernel.world import World
@@ -39,10 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Fly episodes, with as many bare calls after each stretch as it had steps."""
-    if args.repeats < 1:
-        raise ConfigError("--repeats must be 1 or more")
+    bounds.number("--repeats", args.repeats, 1)
     values = {**who.FIXED, "training.episodes": args.repeats, **settings.chosen(args)}
     world = check(settings.config_for("paper", values))
+    bounds.missions(world)
     team = Team(world, first_policy(world))
     flown = [team.fly(episode) for episode in range(1, args.repeats + 1)]
     steps, calls = (median(f[i] for f in flown) for i in (0, 1))

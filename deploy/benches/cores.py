@@ -32,7 +32,7 @@ def worth() -> float | None:
         helper.start("deploy.benches.cores", start, int(alone), env=env)
         for alone in (True, *(False,) * (core_count() - 1))
     ]
-    counts: list[list[int] | None] = [json.loads(helper.output_of(child)) for child in children]
+    counts: list[list[int] | None] = [json.loads(helper.output_of(child) or "null") for child in children]
     there = [count for count in counts if count is not None]
     if len(there) < len(counts):
         return None

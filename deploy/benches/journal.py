@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import median
 
 from deploy import lockstep, settings, who
-from deploy.benches import rollout
+from deploy.benches import bounds, rollout
 from deploy.benches.row import Row
 from deploy.mission import check
 from tmc.analysis.check import check as check_log
@@ -62,13 +62,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Fly once in processes, once in lock step, and journal that again and again; one row a figure."""
-    if args.repeats < 1 or not args.seconds > 0 or not args.pace >= 0:
-        raise ConfigError("--repeats must be 1 or more, --seconds more than 0, and --pace 0 or more")
+    bounds.stretches(args.repeats, args.seconds, 2 * len(CASES))
+    bounds.number("--pace", args.pace, 0.0)
     if not args.dir.is_dir():
         raise ConfigError(f"--dir {args.dir} is no folder: choose one on the disk that runs are written to")
     pilot = who.resolve("planner:greedy")
     first = {"team.size": 10, "training.episodes": 1}
     world = check(build({**pilot.values, **first, **who.FIXED, **settings.chosen(args)}))
+    bounds.missions(world)
     with tempfile.TemporaryDirectory(prefix="overfly-bench-", dir=args.dir) as scratch:
         folder = Path(scratch)
         flown = folder / "flown"

@@ -20,6 +20,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from deploy import helper, plan, settings
+from deploy.benches import bounds
 from deploy.benches.replay import fill
 from deploy.benches.rollout import started, weigh_all
 from deploy.benches.row import Row
@@ -73,10 +74,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Bare loop and mission in turns, then the comparison of results; one row a figure."""
-    if args.repeats < 1 or not args.seconds > 0 or args.steps < 0:
-        raise ConfigError("--repeats must be 1 or more, --seconds more than 0, and --steps 0 or more")
+    bounds.stretches(args.repeats, args.seconds, 3)
+    bounds.number("--steps", args.steps, 0, 1e-3)
     values = {**MISSION, "training.threads": args.threads, **settings.chosen(args)}
     world = check(settings.config_for("paper", values))
+    bounds.training(world, warm_up(world.config))
     bare: list[float] = []
     tuned: list[float] = []
     flown: list[Learned] = []
@@ -125,7 +127,7 @@ def bare_loop(config: Config, seconds: float, name: str) -> float:
 def fly(world: World, seconds: float, out: Path) -> Learned:
     """A mission in processes of its own; time is taken once the memory is full and theta- has changed."""
     config = world.config
-    warm = config.replay.capacity // config.team.size + config.dqn.target_updates
+    warm = warm_up(config)
     begun = time.monotonic()
     with started(config, None, out) as (supervisor, observer):
         first, _ = _wait(supervisor, observer, updates=1)
@@ -140,16 +142,24 @@ def fly(world: World, seconds: float, out: Path) -> Learned:
     return Learned(updates / span, ticks, first - begun, total, _idle(out, seconds), spent)
 
 
+def warm_up(config: Config) -> int:
+    """Updates after which the memory is full and theta- has changed."""
+    return config.replay.capacity // config.team.size + config.dqn.target_updates
+
+
 def _wait(
     supervisor: Supervisor, observer: Observer, updates: int = 0, until: float = 0.0
 ) -> tuple[float, messages.Status]:
     """(seconds of the clock, status) when there have been `updates`, and the clock is past `until`."""
+    pace = bounds.Pace("the updates that come before:", updates)
     while True:
         if supervisor.watch():
             raise ConfigError("the mission was over before it was measured: give it more --episodes or --ticks")
         status, now = observer.ask(), time.monotonic()
         if status is not None and status.updates >= updates and now >= until:
             return now, status
+        if status is not None and updates > 1:
+            pace.check(status.updates)
         time.sleep(POLL)
 
 
@@ -188,8 +198,9 @@ def compare(world: World, steps: int) -> Iterator[Row]:
 def _batches(replay: Replay, count: int) -> Iterator[Batch]:
     from learner.intake import Intake  # noqa: PLC0415
 
-    intake = Intake(replay.observer)
+    intake, pace = Intake(replay.observer), bounds.Pace("--steps", count)
     for number in range(count):
+        pace.check(number)
         if number % 200 == 199:
             say(f"{number + 1:,} of {count:,} steps compared")
         s = replay.sample(number, replay.world.config.dqn.batch)

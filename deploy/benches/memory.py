@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from deploy import settings
-from deploy.benches import replay, rollout
+from deploy.benches import bounds, replay, rollout
 from deploy.benches.row import Row
 from deploy.mission import check
 from tmc.kernel.config import ConfigError
@@ -39,10 +39,16 @@ def measure(args: argparse.Namespace) -> list[Row]:
     values = {"training.episodes": 1_000_000, **settings.chosen(args)}  # it is stopped, not finished
     world = check(settings.config_for("paper", values))
     config = world.config
+    bounds.training(world, 1)
     least, most = max(config.replay.learn_start, config.dqn.batch), config.training.episodes * config.training.ticks
     if not least < args.transitions < most * config.team.size:
         raise ConfigError(
             f"--transitions must be more than the {least:,} before the first update, and come to be flown"
+        )
+    if args.transitions > config.replay.capacity:
+        raise ConfigError(
+            f"--transitions {args.transitions:,} is more than the replay memory holds: choose "
+            f"{config.replay.capacity:,} or less, or set replay.capacity to more"
         )
     with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:
         memory = in_training(world, args.transitions, Path(scratch))
@@ -52,7 +58,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
 def in_training(world: World, transitions: int, out: Path) -> rollout.Memory | None:
     """The memory of all processes once they have flown so many transitions and learn from them."""
     with rollout.started(world.config, None, out) as (supervisor, observer):
-        told = time.monotonic()
+        told, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
         while not supervisor.watch():
             time.sleep(rollout.POLL)
             status = observer.ask()
@@ -61,8 +67,9 @@ def in_training(world: World, transitions: int, out: Path) -> rollout.Memory | N
             flown = status.ticks * world.config.team.size
             if flown >= transitions and status.updates:
                 return rollout.weigh_all(supervisor.pids())
+            pace.check(flown)
             if time.monotonic() > told + 5.0:
-                told = time.monotonic()
+                told, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
                 print(f"{flown:,} of {transitions:,} transitions", file=sys.stderr, flush=True)
     return None
 

@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deploy import helper, plan, settings
+from deploy.benches import bounds
 from deploy.benches.row import Row
 from deploy.mission import check
-from tmc.kernel.config import ConfigError, build, flat
+from tmc.kernel.config import build, flat
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Floats, Observer
 from tmc.kernel.world import World
@@ -37,6 +38,8 @@ LIMITS = {"bytes": 100.0, "memory": 60.0, "minibatch": 1.5, "inserts": 100_000.0
 minibatch that is drawn by priorities and then changes them."""
 ALPHA = 0.6
 """The exponent of priorities where the settings have none (Schaul et al. 2016, Table 3; Horgan et al. 2018)."""
+MINIBATCH = 0.01
+"""Seconds that a minibatch is taken to need, with its share of what is kept of each until the end."""
 WARM = 5
 """Minibatches that are not timed."""
 
@@ -49,9 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Fill it, then draw from it, in a process of its own; one row a figure."""
-    if args.minibatches < 1:
-        raise ConfigError("--minibatches must be 1 or more")
+    bounds.number("--minibatches", args.minibatches, 1, MINIBATCH)
     world = check(settings.config_for("paper", settings.chosen(args)))
+    bounds.memory(world)
     words = ("deploy.benches.replay", "--minibatches", args.minibatches)
     told = json.dumps(flat(world.config))
     printed = helper.output_of(helper.start(*words, env=plan.environment("tmc", 1)), told)
@@ -96,8 +99,9 @@ def drawn(replay: Replay, minibatches: int) -> list[float]:
     """Milliseconds of the processor that each of so many minibatches takes."""
     batch, (channels, height, width) = replay.world.config.dqn.batch, replay.observer.shape
     images = np.empty((2 * batch, height, width, channels), np.float32).transpose(0, 3, 1, 2)  # as the learner has them
-    errors = np.random.Generator(np.random.Philox(0)).exponential(size=(minibatches + WARM, batch))
-    return [_drawn(replay, number, images, of.astype("f4")) for number, of in enumerate(errors)][WARM:]
+    rng = np.random.Generator(np.random.Philox(0))
+    errors = (rng.exponential(size=batch).astype("f4") for _ in range(minibatches + WARM))
+    return [_drawn(replay, number, images, of) for number, of in enumerate(errors)][WARM:]
 
 
 def _row(case: str, value: float | None, unit: str, limit: str) -> Row:

@@ -23,13 +23,14 @@ from typing import Any
 
 from actors.tracks import create_table
 from deploy import lockstep, plan, settings, who
+from deploy.benches import bounds
 from deploy.benches.row import Row
 from deploy.commands.evaluate import team_sizes
 from deploy.mission import check
 from deploy.progress import Observer
 from deploy.supervisor import Supervisor
 from tmc.journal import Journal
-from tmc.kernel.config import Config, ConfigError, build, flat
+from tmc.kernel.config import Config, build, flat
 from tmc.kernel.world import World
 from tmc.record.reader import Log, decode, run_files
 
@@ -37,6 +38,8 @@ TRANSPORTS = {"table": (True,), "beacons": (False,), "both": (True, False)}
 """Whether the UAVs share a table of tracks, for each value of `--transport`."""
 LIMITS = {"private": 35.0, "memory": 4096.0, "start": 15.0}
 """What is asked of a team of 100: MiB of private memory a UAV, MiB in all, seconds until the first tick is flown."""
+MISSION = 0.5
+"""Seconds that a mission of processes takes at least."""
 POLL = 0.05
 """Seconds between two looks at the processes."""
 
@@ -77,10 +80,11 @@ def measure(args: argparse.Namespace) -> list[Row]:
     """Fly all of it; one row a figure."""
     pilot = who.resolve(args.who)
     values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
-    if args.repeats < 1:
-        raise ConfigError("--repeats must be 1 or more")
+    bounds.number("--repeats", args.repeats, 1, MISSION)
     sizes = [n for n in team_sizes(args.actors) if n is not None]
     worlds = [check(build({**values, "team.size": n}), pilot.policy) for n in sizes]
+    for world in worlds:
+        bounds.missions(world, 2 * args.repeats)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:
         for world in worlds:

@@ -24,11 +24,11 @@ from typing import Any
 import zmq
 
 from deploy import settings
+from deploy.benches import bounds
 from deploy.benches.row import Row
 from deploy.mission import check
 from deploy.plan import ROOT
 from deploy.supervisor import MissionFailed
-from tmc.kernel.config import ConfigError
 from tmc.record import reader
 from tmc.record.errors import RecordError
 from tmc.wire import messages, sockets
@@ -38,6 +38,8 @@ LIMITS = {"run": 5.0, "actor": 0.6}
 """What is asked of a start with warm caches: seconds to the first update of three UAVs, and to a UAV's first word."""
 ROLES = ("tmc", "actors", "learner")
 """The modules of the roles: `python -m ROLE` imports `ROLE.__main__` and what it needs."""
+TURN = 2.0
+"""Seconds that all starts of a turn take at least."""
 PATIENCE = 120.0
 """Seconds after which a start has failed."""
 POLL = 0.05
@@ -53,8 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Every start in turns; one row a figure."""
-    if args.repeats < 1 or args.warm < 0:
-        raise ConfigError("--repeats must be 1 or more, and --warm 0 or more")
+    bounds.number("--repeats", args.repeats, 1, TURN)
+    bounds.number("--warm", args.warm, 0, TURN)
     changes = [word for key, value in settings.chosen(args).items() for word in ("--set", f"{key}={value}")]
     size = check(settings.config_for("quick", settings.chosen(args))).config.team.size
     starts: dict[str, Callable[[Path], float]] = {

@@ -12,11 +12,10 @@ from pathlib import Path
 from statistics import median
 
 from deploy import settings
-from deploy.benches import learner
+from deploy.benches import bounds, learner
 from deploy.benches.row import Row
 from deploy.commands.evaluate import team_sizes
 from deploy.mission import check
-from tmc.kernel.config import ConfigError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,11 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(args: argparse.Namespace) -> list[Row]:
     """Bare loop and missions of each size in turns; one row a figure."""
-    if args.repeats < 1 or not args.seconds > 0:
-        raise ConfigError("--repeats must be 1 or more, and --seconds more than 0")
     values = {**learner.MISSION, "training.threads": args.threads, **settings.chosen(args)}
     sizes = [n for n in team_sizes(args.actors) if n is not None]
+    bounds.stretches(args.repeats, args.seconds, 1 + len(sizes))
     worlds = [check(settings.config_for("paper", {**values, "team.size": n})) for n in sizes]
+    for world in worlds:
+        bounds.training(world, learner.warm_up(world.config))
     flown: list[list[learner.Learned]] = [[] for _ in worlds]
     bare: list[float] = []
     with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:

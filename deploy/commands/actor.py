@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from actors.__main__ import fly
+from deploy import extras
 from tmc.kernel.config import ConfigError
 
 MOST = 65_536
@@ -24,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Fly until the TMC ends the mission."""
+    extras.require()
     if not 0 <= args.id < MOST:
         raise ConfigError(f"--id {args.id} is no number of a UAV: choose 0 to {MOST - 1:,}")
     stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")

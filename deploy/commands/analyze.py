@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from deploy import extras
 from tmc.analysis import report as reports
 from tmc.analysis.flown import Flown, read
 from tmc.analysis.metrics import summarize
@@ -15,8 +16,6 @@ from tmc.analysis.summary import Summary
 from tmc.kernel.config import ConfigError
 from tmc.record import disk
 from tmc.record.errors import RecordError
-
-NO_MATPLOTLIB = "no pictures, as matplotlib is not installed: pip install 'overfly[figures]'"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,12 +88,16 @@ def _keep(path: Path, text: str, *, pictures: bool) -> bool:
 
 def _draw(flown: Flown, summary: Summary, episode: int | None, lines: Mapping[str, float]) -> list[Path]:
     """The pictures; none, and a sentence on stderr, without matplotlib."""
-    try:
-        from tmc.analysis import figures  # noqa: PLC0415  half a second, and an extra
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "matplotlib":
-            raise
-        print(f"overfly: {NO_MATPLOTLIB}", file=sys.stderr)
+    why = extras.lacking(extras.FIGURES)
+    if not why:
+        try:
+            from tmc.analysis import figures  # noqa: PLC0415  half a second, and an extra
+        except Exception as error:
+            why = extras.broken(error)
+            if not why:
+                raise
+    if why:
+        print(f"overfly: no pictures: {why}", file=sys.stderr)
         return []
     try:
         return figures.draw(flown, summary, episode, lines)

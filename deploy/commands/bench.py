@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import signal
+import subprocess
 import sys
 from dataclasses import asdict, dataclass
 
+from deploy import extras
 from deploy.benches import cores
 from deploy.benches.row import finite, machine, text
 from deploy.supervisor import MissionFailed
@@ -16,25 +19,30 @@ from tmc.wire.process import FAILED
 
 @dataclass(frozen=True)
 class Bench:
-    """One row: its name, the module with `add_arguments(parser)` and `measure(args) -> list[Row]`, one line of help."""
+    """One row: its name, the module with `add_arguments(parser)` and `measure(args) -> list[Row]`, one line of help,
+    and the extras that it needs."""
 
     name: str
     module: str
     about: str
+    needs: tuple[str, ...] = ()
 
 
+WITH_LEARNER = (extras.LEARNER,)
 BENCHES: tuple[Bench, ...] = (
     Bench("rollout", "deploy.benches.rollout", "UAV steps a second of N processes against the fleet in one process"),
     Bench("journal", "deploy.benches.journal", "what the TMC's journal takes, a commit costs, and a UAV step leaves"),
-    Bench("learner", "deploy.benches.learner", "updates a second of a running mission against the bare compute loop"),
-    Bench("startup", "deploy.benches.startup", "seconds to the first update, to a UAV's first word, and of imports"),
-    Bench(
-        "memory", "deploy.benches.memory", "memory of all processes of a training, by role, and of the replay memory"
-    ),
-    Bench("train", "deploy.benches.train", "ticks a second of the whole recipe, start and memory, for some team sizes"),
+    Bench("learner", "deploy.benches.learner", "updates a second of a running mission against the bare compute loop",
+          WITH_LEARNER),
+    Bench("startup", "deploy.benches.startup", "seconds to the first update, to a UAV's first word, and of imports",
+          WITH_LEARNER),
+    Bench("memory", "deploy.benches.memory", "memory of all processes of a training, by role, and of the replay memory",
+          WITH_LEARNER),
+    Bench("train", "deploy.benches.train", "ticks a second of the whole recipe, start and memory, for some team sizes",
+          WITH_LEARNER),
     Bench("replay", "deploy.benches.replay", "bytes a transition, milliseconds a minibatch, inserts a second"),
-    Bench("actor", "deploy.benches.actor", "a whole UAV step against the bare call of ONNX Runtime"),
-)
+    Bench("actor", "deploy.benches.actor", "a whole UAV step against the bare call of ONNX Runtime", WITH_LEARNER),
+)  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,13 +56,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Measure, then print the table, or a line of JSON a figure with the machine and the versions."""
+    bench = next(bench for bench in BENCHES if bench.name == args.bench)
+    extras.require(*bench.needs)
     facts = machine()
     before = cores.worth()
-    bench = importlib.import_module(next(b.module for b in BENCHES if b.name == args.bench))
     try:
-        rows = bench.measure(args)
+        rows = importlib.import_module(bench.module).measure(args)
     except MissionFailed as failed:
         print(f"overfly: {failed}", file=sys.stderr)
+        return FAILED
+    except subprocess.CalledProcessError as failed:  # what it had to say stands above
+        code = failed.returncode
+        how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        print(f"overfly: a process that was measured {how}", file=sys.stderr)
         return FAILED
     facts["cores_worth"] = [before, cores.worth()]
     if args.json:

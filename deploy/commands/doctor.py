@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import shutil
 import tempfile
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
-from deploy import settings
+from deploy import extras, settings
 from tmc.kernel.config import SETTINGS, flat
 from tmc.kernel.world import World
-
-PACKAGES: tuple[tuple[str, str, str], ...] = (
-    ("numpy", "", "arithmetic of the world"),
-    ("pyzmq", "", "sockets"),
-    ("msgpack", "", "messages"),
-    ("mcap", "", "logs"),
-    ("protobuf", "", "logs"),
-    ("foxglove-schemas-protobuf", "", "logs that viewers know"),
-    ("onnxruntime", "", "policies in the UAVs"),
-    ("torch", "learner", "training"),
-    ("onnx", "learner", "policy files"),
-    ("safetensors", "learner", "checkpoints"),
-    ("matplotlib", "figures", "pictures"),
-)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,8 +27,8 @@ def main(args: argparse.Namespace) -> int:
     if args.settings:
         return _settings(args.preset)
     fine = True
-    for name, extra, purpose in PACKAGES:
-        fine &= _package(name, extra, purpose)
+    for package in extras.packages():
+        fine &= _package(package)
     for what, look in CHECKS.items():
         try:
             print(f"  ok    {what}: {look()}")
@@ -52,14 +39,21 @@ def main(args: argparse.Namespace) -> int:
     return 0 if fine else 1
 
 
-def _package(name: str, extra: str, purpose: str) -> bool:
-    try:
-        print(f"  ok    {name} {version(name)}: {purpose}")
-    except PackageNotFoundError:
-        mend = f"pip install 'overfly[{extra}]'" if extra else "pip install overfly"
-        print(f"  {'none' if extra else 'BAD '}  {name}: needed for {purpose}; {mend}")
-        return bool(extra)
-    return True
+def _package(package: extras.Package) -> bool:
+    """Whether a package can be used; one of an extra may be missing, but not be too old or broken."""
+    problem, purpose, fix = package.problem(), extras.PURPOSES[package.name], extras.install(package.extra)
+    if not problem:
+        try:
+            importlib.import_module(package.module)
+        except Exception as error:
+            fix = extras.broken(error) or f"{package.name} cannot be imported ({error})"
+            print(f"  BAD   {fix}")
+            return False
+        print(f"  ok    {package.name} {version(package.name)}: {purpose}")
+        return True
+    optional = bool(package.extra) and problem == extras.MISSING
+    print(f"  {'none' if optional else 'BAD '}  {package.name} ({problem}): needed for {purpose}; run {fix}")
+    return optional
 
 
 def _world() -> str:

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from statistics import mean, stdev
 from typing import Any
 
-from deploy import lockstep, pool, settings, who
+from deploy import extras, lockstep, pool, settings, who
 from deploy.mission import bound_of, check
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.policy import FlightError
@@ -75,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Fly them all, then print the table."""
+    extras.require()
     if args.seeds < 1 or args.jobs < 1:
         raise ConfigError("--seeds and --jobs must be 1 or more")
     if args.seed is not None or args.episodes is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from deploy import mission, settings, who
+from deploy import extras, mission, settings, who
 from deploy.commands.analyze import report
 from deploy.commands.run import add_mission_options
 from tmc.kernel.config import build
@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
+    extras.require()
     pilot = who.resolve(args.who)
     values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args), **who.pilot_of(pilot)}
     world = mission.check(build(values), pilot.policy, pilot.name)

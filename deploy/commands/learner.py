@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from deploy import extras
 from tmc.wire import process
 
 
@@ -17,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Learn until the TMC ends the mission."""
+    extras.require(extras.LEARNER)
     from learner.__main__ import MISTAKES, learn  # noqa: PLC0415  torch is imported only when a learner is meant
 
     return process.run(lambda: learn(args.connect, args.out), MISTAKES)

@@ -12,7 +12,7 @@ from pathlib import Path
 from deploy.commands import log_check, log_export
 from tmc.record import facts
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, info, run_files
+from tmc.record.reader import Log, info, logs_in, run_files
 from tmc.wire.process import DONE, FAILED
 
 JOURNAL_VIEWS = ("moves", "uncertainty", "events", "digest")
@@ -72,13 +72,9 @@ def _damage(run: Path) -> str | None:
     return None if log.still_open else log.damage
 
 
-def _files(run: Path) -> dict[str, Path]:
-    return {run.name: run} if run.is_file() else run_files(run)
-
-
 def _info(args: argparse.Namespace) -> int:
     rows = []
-    for process, path in _files(args.run).items():
+    for process, path in logs_in(args.run).items():
         found = info(path)
         for name, topic in found.topics.items():
             rows.append({"process": process, "topic": name, "schema": topic.schema, "messages": topic.count})
@@ -101,7 +97,7 @@ def _cat(args: argparse.Namespace) -> int:
     from google.protobuf.json_format import MessageToDict  # noqa: PLC0415  slow to import, used only here
 
     wanted, damage = set(args.topic or ()), []
-    for path in _files(args.run).values():
+    for path in logs_in(args.run).values():
         log = Log(path)
         for entry in log.entries(args.topic):
             wanted.discard(entry.topic)

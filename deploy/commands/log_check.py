@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from deploy.commands.log_export import fresh
 from deploy.progress import PLAIN_EVERY
 from tmc.analysis import check
-from tmc.record.errors import RecordError
-from tmc.record.reader import run_files
+from tmc.record.errors import NoLogError, RecordError
+from tmc.record.reader import logs_in
 from tmc.record.recover import Recovery, recover
 from tmc.record.seal import seal_run
-from tmc.wire.process import DONE, FAILED
+from tmc.wire.process import DONE, FAILED, USAGE
 
 LOSS = 3
 """Exit code: done, but something is lost."""
@@ -58,15 +60,14 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _recover(args: argparse.Namespace) -> int:
-    if args.out is not None and args.run.is_dir():
+    if args.out is not None and os.path.isdir(args.run):  # noqa: PTH112  never raises
         raise RecordError(f"--out is for one file, and {args.run} is a folder: leave it out, or name the file")
-    try:
-        paths = list(run_files(args.run).values()) if args.run.is_dir() else [args.run]
-    except RecordError as error:
-        return _failed(error)
-    show = _Progress()
-    codes = [_recover_one(path, args, show) for path in paths]
-    return FAILED if FAILED in codes else max(codes)
+    fresh(args.out)
+    paths, show = logs_in(args.run).values(), _Progress()
+    codes = {_recover_one(path, args, show) for path in paths}
+    if codes == {USAGE}:
+        return USAGE
+    return FAILED if codes & {USAGE, FAILED} else max(codes)
 
 
 def _recover_one(path: Path, args: argparse.Namespace, show: _Progress) -> int:
@@ -79,8 +80,9 @@ def _recover_one(path: Path, args: argparse.Namespace, show: _Progress) -> int:
 
 
 def _failed(error: RecordError) -> int:
+    """Say it; what is not a log at all is a mistake in the command, as everywhere."""
     print(f"overfly: {error}", file=sys.stderr)
-    return FAILED
+    return USAGE if isinstance(error, NoLogError) else FAILED
 
 
 def _seal(args: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from deploy.progress import PLAIN_EVERY
 from tmc.analysis import replayfile
 from tmc.record.errors import RecordError
 from tmc.record.merge import merge
-from tmc.record.reader import run_files
+from tmc.record.reader import logs_in
 from tmc.wire.process import DONE, FAILED
 
 ABOUT = {
@@ -36,10 +37,8 @@ def add_options(view: str, parser: argparse.ArgumentParser) -> None:
 
 
 def _merge(args: argparse.Namespace) -> int:
-    files = {args.run.name.partition(".")[0]: args.run} if args.run.is_file() else run_files(args.run)
-    folder = args.run.parent if args.run.is_file() else args.run
-    word = _Progress()
-    out = _fresh(args.out) or folder / "merged.mcap"
+    files, word = logs_in(args.run), _Progress()
+    out = fresh(args.out) or next(iter(files.values())).parent / "merged.mcap"
     merged = merge(files, out, args.prefix, lambda done, of: word.say(f"message {done:,} of {of:,}"))
     word.clear()
     for path in merged.open:
@@ -53,7 +52,7 @@ def _merge(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     word = _Progress()
-    out = _fresh(args.out) or replayfile.default_path(args.run, args.episode)
+    out = fresh(args.out) or replayfile.default_path(args.run, args.episode)
     made = replayfile.write(args.run, args.episode, out, word.say)
     word.clear()
     flown = made.flown
@@ -68,9 +67,9 @@ def _replay(args: argparse.Namespace) -> int:
     return FAILED if flown.damage else DONE
 
 
-def _fresh(out: Path | None) -> Path | None:
+def fresh(out: Path | None) -> Path | None:
     """The file that the user named, if any; RecordError rather than write over one."""
-    if out is not None and out.exists():
+    if out is not None and os.path.lexists(out):
         raise RecordError(f"{out} exists already: choose another --out, or remove it")
     return out
 

@@ -7,11 +7,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from deploy import extras
 from tmc.kernel.rastertext import COMMENT, raster_text
 from tmc.kernel.roadmap import OBSTACLES, ROADS, MapError, RoadMap, builtin_maps, check, load_map
 
 DEFAULT = "downtown-toronto"
-NO_MATPLOTLIB = "a picture needs matplotlib: pip install 'overfly[figures]'"
 ABOUT = {
     "list": "the maps that come with Overfly, and what their presets count",
     "show": "draw a map as text that --map takes, and as a picture with --out",
@@ -60,6 +60,8 @@ def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
         raise MapError(f"--out {out} is no PNG: give a name that ends in .png")
     if out is not None and out.exists():
         raise MapError(f"{out} exists already: choose another --out, or remove it")
+    if out is not None and (why := extras.lacking(extras.FIGURES)):
+        raise MapError(why)
     print(drawing(road_map))
     if out is not None:
         _picture(road_map, out)
@@ -82,12 +84,8 @@ def drawing(road_map: RoadMap) -> str:
 
 
 def _picture(road_map: RoadMap, out: Path) -> None:
-    try:
-        from tmc.analysis.figures import map_picture  # noqa: PLC0415  half a second, and an extra
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "matplotlib":
-            raise
-        raise MapError(NO_MATPLOTLIB) from None
+    from tmc.analysis.figures import map_picture  # noqa: PLC0415  half a second, and an extra
+
     map_picture(road_map, out)
 
 

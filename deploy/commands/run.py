@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from deploy import mission, settings
+from deploy import extras, mission, settings
 from deploy.commands.analyze import report
 from tmc.kernel.config import ConfigError
 
@@ -34,6 +34,7 @@ def main(args: argparse.Namespace) -> int:
     if args.preset is None:
         raise ConfigError(f"which preset? choose {', '.join(settings.preset_names())}, or --resume RUN")
     config = settings.config_for(args.preset, settings.chosen(args))
+    extras.require(*mission.needs(config, None))
     world = mission.check(config)
     mission.check_training(config)
     out = mission.new_folder(args.out, args.preset)
@@ -52,5 +53,6 @@ def resume(args: argparse.Namespace) -> int:
         print(f"overfly: {args.resume} was flown to its end: this is its summary", file=sys.stderr)
         return report(args.resume, as_json=args.json, pictures=not args.no_pictures)
     world, policy = mission.interrupted(args.resume)
+    extras.require(*mission.needs(world.config, policy))
     code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)
     return code or report(args.resume, as_json=args.json, pictures=not args.no_pictures)

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from deploy import mission, settings, who
+from deploy import extras, mission, settings, who
 from deploy.progress import Progress
 from tmc.__main__ import serve
 from tmc.kernel.config import Config, ConfigError, build, flat
@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Serve until the mission is over."""
+    extras.require()
     check_free(args.bind)
     if args.resume is not None:
         return resume(args)

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from deploy import asynchrony, exactness, settings, who
+from deploy import asynchrony, exactness, extras, settings, who
 from deploy.commands import verify_chaos
 from deploy.mission import check, new_folder
 from deploy.progress import PLAIN_EVERY, clock
@@ -55,6 +55,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Verify; exit code 1 when something is not as it should be."""
+    extras.require()
     try:
         return MAINS[args.kind](args)
     except exactness.Stopped as stopped:

@@ -12,11 +12,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from deploy import settings, who
+from deploy import extras, settings, who
 from deploy.chaos import trial
 from deploy.chaos.blows import CUT, POWER, STOP, Blow, blows
 from deploy.chaos.storm import Storm
-from deploy.mission import check, new_folder
+from deploy.mission import check, needs, new_folder
 from deploy.progress import clock
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.roster import LEARNER, uav_name
@@ -51,6 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace, say: Callable[[str], None], clear: Callable[[], None]) -> int:
     """Run the trial; exit code 1 when anything is not as it should be."""
     config, policy = _config(args)
+    extras.require(*needs(config, policy))
     storm_blows = _blows(args, config)
     place = Path(tempfile.mkdtemp(prefix="overfly-chaos-")) if args.keep is None else new_folder(args.keep, "chaos")
     storm = Storm(storm_blows, say, place / "diary.txt", until_loss=args.ack_early)

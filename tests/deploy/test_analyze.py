@@ -45,7 +45,8 @@ def test_without_matplotlib_it_says_how_to_install_it_and_goes_on(run, capsys, m
     monkeypatch.setattr(sys, "meta_path", [NoMatplotlib(), *sys.meta_path])
     assert report(run, as_json=False) == 0
     printed = capsys.readouterr()
-    assert "pip install 'overfly[figures]'" in printed.err and len(printed.err.splitlines()) == 1
+    assert "no pictures: a picture needs matplotlib (not installed): run " in printed.err
+    assert "-m pip install " in printed.err and len(printed.err.splitlines()) == 1
     assert "Pictures" not in printed.out and "Uncertainty" in printed.out
 
 

@@ -36,18 +36,25 @@ def missions(once: Callable[[str, Callable[[Path], object]], Path], trained: Cal
     return once("readers", lambda folder: make(folder, trained(1)))
 
 
-FOLDERS = {
-    "finished": ("trained", "flown", "losing"),
-    "made": ("made", "sealed"),
-    "resumed": ("resumed-killed", "resumed-cut"),
-    "recovered": ("recovered-killed", "recovered-cut"),
+LIVE = ("trained", "flown", "losing", "lockstep")
+"""Runs that ended in order."""
+KINDS = {
+    "tmc": [f"{name}/tmc.mcap" for name in LIVE],
+    "learner": ["trained/learner.mcap"],
+    "uav": [f"{name}/uav-*.mcap" for name in LIVE],
+    "sealed": ["sealed/*.mcap"],
+    "merged": ["merged/*.mcap"],
+    "replay": ["replay/*.mcap"],
+    "resumed": ["resumed-*/*.mcap"],
+    "recovered": ["recovered-*/*.mcap"],
 }
+"""Each kind of file that we write, and where the missions have left it."""
 
 
-@pytest.fixture(params=FOLDERS)
+@pytest.fixture(params=KINDS)
 def logs(request: pytest.FixtureRequest, missions: Path) -> list[Path]:
-    """Every finished log: of runs that ended in order, made of these, or recovered of the killed one in each way."""
-    paths = [path for name in FOLDERS[request.param] for path in sorted((missions / name).glob("*.mcap"))]
+    """Every finished file of a kind: each reader gets each kind."""
+    paths = [path for pattern in KINDS[request.param] for path in sorted(missions.glob(pattern))]
     assert paths
     return paths
 

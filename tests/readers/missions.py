@@ -26,6 +26,15 @@ LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictu
           "--set", "comms.patience=0.5", "--set", "comms.lost_after=1", "--set", "journal.flush=0.1")  # fmt: skip
 CHUNK = 0x06
 """The opcode of a chunk of messages."""
+MADE = {
+    "merged/flown.mcap": ("merge", "flown"),
+    "merged/trained.mcap": ("merge", "trained", "--prefix", "A"),
+    "merged/killed.mcap": ("merge", "killed"),
+    "replay/flown.mcap": ("replay", "flown"),
+    "replay/trained.mcap": ("replay", "trained", "--episode", "2"),
+    "replay/losing.mcap": ("replay", "losing"),
+}
+"""Files for viewers, and what makes them."""
 WRITERS = ("tmc", "learner", "uav-000", "uav-001")
 
 
@@ -35,9 +44,8 @@ def make(folder: Path, trained: Path) -> None:
     done = overfly(*FLOWN, "--out", folder / "flown", cwd=folder)
     assert done.returncode == 0, done.stderr
     lose_one(folder / "losing")
-    for view in ("merge", "replay"):
-        done = here("log", view, folder / "flown", "--out", folder / "made" / f"{view}.mcap", cwd=folder)
-        assert done.returncode == 0, done.stderr
+    done = here(*FLOWN, "--lockstep", "--out", folder / "lockstep", cwd=folder)
+    assert done.returncode == 0, done.stderr
     shutil.copytree(folder / "trained", folder / "sealed")
     done = here("log", "seal", folder / "sealed", cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -46,6 +54,9 @@ def make(folder: Path, trained: Path) -> None:
     for left in (folder / "killed", folder / "cut"):
         resume(left, folder / f"resumed-{left.name}")
         recover(left, folder / f"recovered-{left.name}")
+    for file, (view, run, *more) in MADE.items():
+        done = here("log", view, folder / run, "--out", folder / file, *more, cwd=folder)
+        assert done.returncode == 0, done.stderr
 
 
 def cut(log: Path, folder: Path) -> None:

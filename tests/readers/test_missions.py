@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.readers.conftest import KINDS
 from tests.readers.missions import WRITERS
 from tmc.record.channels import CHANNELS, REPLAY_CHANNELS, Channel
 from tmc.record.reader import Log, info
@@ -20,7 +21,13 @@ def test_every_topic_is_in_a_finished_log(missions: Path) -> None:
     files = [file for name in ("trained", "flown", "losing") for file in sorted((missions / name).glob("*.mcap"))]
     assert all(Log(file).finished for file in files) and len(files) == 11
     assert missing(CHANNELS, files) == []
-    assert missing(REPLAY_CHANNELS, [missions / "made" / "replay.mcap"]) == []
+    assert missing(REPLAY_CHANNELS, [missions / "replay" / "flown.mcap"]) == []
+
+
+def test_every_finished_file_is_of_a_kind(missions: Path) -> None:
+    of_a_kind = [path for patterns in KINDS.values() for pattern in patterns for path in missions.glob(pattern)]
+    assert sorted(of_a_kind) == sorted(missions.glob("*/*.mcap"))
+    assert all(Log(path).finished for path in of_a_kind)
 
 
 @pytest.mark.parametrize("left, names", [("killed", WRITERS), ("cut", ("tmc",))])

@@ -16,7 +16,7 @@ from tests.command import PATIENCE
 from tests.readers.conftest import Topic
 from tmc.record.reader import Log
 
-MISSING = "needs pybag-sdk: pip install 'overfly[readers]'"
+MISSING = "needs pybag-sdk: pip install '.[readers]'"
 
 
 def message_class(schema: Any) -> Any:

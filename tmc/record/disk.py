@@ -10,12 +10,20 @@ from typing import IO, Any
 
 from tmc.kernel import files
 from tmc.record.channels import ACTIVE
-from tmc.record.errors import RecordError
+from tmc.record.errors import NoLogError, RecordError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of a disk that holds no more."""
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
 """Errors of a file system that knows no locks, or, as NFS, none of files opened to read: there, nothing is held."""
+
+
+def open_log(path: Path) -> IO[bytes]:
+    """Open a log to read. NoLogError where that is not possible, or would wait for ever as a pipe's end does."""
+    try:
+        return files.opened(path)
+    except OSError as error:
+        raise NoLogError(f"{path} cannot be read ({error.strerror}): give the file of a log") from None
 
 
 def left_behind(path: Path, resume: bool) -> Path | None:
@@ -31,9 +39,7 @@ def left_behind(path: Path, resume: bool) -> Path | None:
 
 def open_held(path: Path, mode: str) -> Any:
     """Open a log and keep other writers away from it until it is closed; RecordError when one has it already."""
-    if mode == "rb":
-        files.check(path)
-    file: IO[bytes] = open(path, mode, opener=_whole)  # noqa: SIM115  whoever asked for it closes it
+    file = open_log(path) if mode == "rb" else open(path, mode, opener=_whole)  # noqa: SIM115  whoever asks closes it
     try:
         _hold(file, path)
         if mode == "wb":
@@ -45,8 +51,8 @@ def open_held(path: Path, mode: str) -> Any:
 
 
 def _whole(name: str, flags: int) -> int:
-    """Opens without cutting the file: it may be somebody else's."""
-    return os.open(name, flags & ~os.O_TRUNC, 0o666)
+    """Opens without cutting the file, which may be somebody else's, and without waiting for who reads a pipe."""
+    return os.open(name, flags & ~os.O_TRUNC | os.O_NONBLOCK, 0o666)
 
 
 def _hold(file: IO[bytes], path: Path) -> None:

@@ -11,11 +11,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
-from mcap.writer import CompressionType, Writer
-
 from tmc.record import schemas
 from tmc.record.channels import ACTIVE, CHANNELS, role
 from tmc.record.errors import RecordError
+from tmc.record.mcapwriter import mcap_writer
 
 CHUNK = 2**20
 """Bytes of a chunk before compression."""
@@ -41,7 +40,7 @@ class Export:
             self._file = self._new.open("wb")
         except OSError as error:
             raise self._unwritable(error) from None
-        self._writer = Writer(self._file, CHUNK, CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
+        self._writer = mcap_writer(self._file, CHUNK)
         with self._guard():
             self._writer.start(profile="overfly")
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
+from tmc.record.disk import open_log
 from tmc.record.errors import RecordError
 from tmc.record.export import Export
 from tmc.record.frames import DamageError, Raw, contents
@@ -63,9 +64,9 @@ def merge(
     What is damaged is merged up to the damage. Raises RecordError when nothing can be read or `out` not be written.
     """
     before = topic_prefix(prefix)
-    if out.resolve() in {path.resolve() for path in files.values()}:
-        raise RecordError(f"{out} is one of the files to merge: choose another name for the merged one")
     sources, damage = _sources(files)
+    if out.resolve() in {source.log.path.resolve() for source in sources}:
+        raise RecordError(f"{out} is one of the files to merge: choose another name for the merged one")
     total, written = sum(source.messages for source in sources), 0
     with Export(out) as export:
         _carry_over(sources, export, before)
@@ -106,7 +107,7 @@ def _sources(files: Mapping[str, Path]) -> tuple[list[_Source], list[str]]:
 def _survey(process: str, path: Path) -> _Source:
     source, last = _Source(process, Log(path)), 0
     try:
-        with path.open("rb") as file:
+        with open_log(path) as file:
             for item in contents(file):
                 if isinstance(item, Attachment):
                     source.attachments.append(item)

@@ -15,9 +15,9 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from tmc.kernel import files
 from tmc.record.channels import ACTIVE
-from tmc.record.errors import RecordError
+from tmc.record.disk import open_log
+from tmc.record.errors import NoLogError, RecordError
 from tmc.record.frames import MAGIC, RECOVERED, DamageError, Raw, contents
 from tmc.record.salvage import goes_on
 from tmc.record.schemas import message_class
@@ -121,7 +121,7 @@ class Log:
     def _items(self) -> Iterator[list[Raw] | Metadata | Attachment | None]:
         damage, finished = None, False
         try:
-            with self.path.open("rb") as file:
+            with open_log(self.path) as file:
                 for item in contents(file):
                     finished = item is None
                     yield item
@@ -133,14 +133,12 @@ class Log:
 
 
 def _check_start(path: Path) -> None:
-    try:
-        start = files.read_bytes(path, len(MAGIC))
-    except OSError as error:
-        raise RecordError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
+    with open_log(path) as file:
+        start = file.read(len(MAGIC))
     if not start:
-        raise RecordError(f"{path} is empty: its process was killed before it wrote, so there is nothing to read")
+        raise NoLogError(f"{path} is empty: its process was killed before it wrote, so there is nothing to read")
     if not MAGIC.startswith(start):
-        raise RecordError(f"{path} is not an MCAP file: give one that ends in .mcap or .mcap{ACTIVE}")
+        raise NoLogError(f"{path} is not an MCAP file: give one that ends in .mcap or .mcap{ACTIVE}")
 
 
 def decode(raw: Raw) -> Any:
@@ -168,21 +166,31 @@ def read(path: str | os.PathLike[str], topics: Collection[str] | None = None) ->
 
 
 def run_files(folder: str | os.PathLike[str]) -> dict[str, Path]:
-    """{process: its log} of a run, `tmc` and `learner` first; RecordError when the folder holds none.
+    """{process: its log} of a run, `tmc` and `learner` first; NoLogError when the folder holds none.
 
     Where both names exist, a resumed log is just taking over from the finished one, and holds all of it, unless it is
     empty.
     """
     folder = Path(folder)
-    paths = sorted(p for p in folder.glob("*.mcap*") if _LOG_NAME.fullmatch(p.name) and p.is_file())
+    paths, why = list[Path](), "tmc.mcap and others"
+    try:
+        paths = sorted(p for p in folder.iterdir() if _LOG_NAME.fullmatch(p.name) and p.is_file())
+    except OSError as error:
+        why = str(error.strerror)
     if not paths:
-        raise RecordError(f"{folder} holds no logs of a run (tmc.mcap and others): give the folder of a run")
+        raise NoLogError(f"{folder} holds no logs of a run ({why}): give the folder of a run")
     found: dict[str, Path] = {}
     for path in paths:
         name = path.name.partition(".")[0]
         if name not in found or path.stat().st_size or not found[name].stat().st_size:
             found[name] = path
     return dict(sorted(found.items(), key=lambda item: (item[0].startswith("uav"), item[0] != "tmc", item[0])))
+
+
+def logs_in(path: str | os.PathLike[str]) -> dict[str, Path]:
+    """{process: its log} of the folder of a run, or of what was given as a single log."""
+    path = Path(path)
+    return run_files(path) if os.path.isdir(path) else {path.name.partition(".")[0]: path}  # noqa: PTH112  never raises
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from mcap.records import Metadata
 from tmc.kernel.config import Journal
 from tmc.record import disk, rewrite
 from tmc.record.channels import ACTIVE
-from tmc.record.errors import RecordError
+from tmc.record.errors import NoLogError, RecordError
 from tmc.record.findings import Findings, Item, Show, unseen
 from tmc.record.frames import RECOVERED
 from tmc.record.salvage import salvage
@@ -76,7 +77,7 @@ def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show
         if found.finished and found.whole and not found.notes:
             return Recovery(path, None, found)
         target = finished_name(path) if in_place else out or recovered_name(path)
-        if target.exists() and not (in_place and target == path):
+        if os.path.lexists(target) and not (in_place and target == path):
             mend = "remove the one that you do not want" if in_place else "choose another --out, or remove it"
             raise RecordError(f"{target} exists already: {mend}")
 
@@ -96,16 +97,16 @@ def held(path: Path) -> IO[bytes]:
     try:
         file: IO[bytes] = disk.open_held(path, "rb")
     except OSError as error:
-        raise RecordError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
+        raise NoLogError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
     return file
 
 
 def survey(path: Path, show: Show) -> Findings:
-    """Read all of a file; RecordError when there is nothing sound in it."""
+    """Read all of a file; NoLogError when there is nothing sound in it."""
     found, items = salvage(path, "reading", show)
     sound = sum(1 for _ in items)
     if not sound and not (found.finished and found.whole):
-        raise RecordError(f"{path} holds nothing that is sound: it is no MCAP file, or damaged all over")
+        raise NoLogError(f"{path} holds nothing that is sound: it is no MCAP file, or damaged all over")
     return found
 
 

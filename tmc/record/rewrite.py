@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import IO
 
 from mcap.records import Attachment, Channel, Metadata, Schema
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from tmc.record import disk
 from tmc.record.errors import RecordError
 from tmc.record.findings import Item
+from tmc.record.mcapwriter import mcap_writer
 
 
 def write(
@@ -44,7 +45,7 @@ def write(
 
 
 def _fill(file: IO[bytes], chunk: int, profile: str, items: Iterable[Item]) -> int:
-    copy = _Copy(Writer(file, chunk, CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True))
+    copy = _Copy(mcap_writer(file, chunk))
     copy.writer.start(profile=profile)
     for item in items:
         copy.take(item)

@@ -23,7 +23,8 @@ from mcap.records import Attachment, Chunk, Footer, Header, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 
 from tmc.record.chunks import HEAD, ChunkReader, Known, UnsoundError
-from tmc.record.errors import RecordError
+from tmc.record.disk import open_log
+from tmc.record.errors import NoLogError
 from tmc.record.findings import CUT, Findings, Item, Lost, Message, Show, unseen
 from tmc.record.frames import MAGIC, RECOVERED
 
@@ -40,16 +41,16 @@ _DATA_END = HEAD.size + 4
 def salvage(path: Path, what: str = "", show: Show = unseen) -> tuple[Findings, Iterator[Item]]:
     """What is sound in a file, in its order; the findings are complete when all of it was taken.
 
-    `what` is done with the items, which `show` is told. RecordError when the file cannot be read or is empty.
+    `what` is done with the items, which `show` is told. NoLogError when the file cannot be read or is empty.
     """
     found = Findings()
     try:
-        with path.open("rb") as file:
+        with open_log(path) as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
-        raise RecordError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
+        raise NoLogError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
     except ValueError:  # mmap knows no empty files
-        raise RecordError(f"{path} is empty: its process was killed before it wrote; remove it") from None
+        raise NoLogError(f"{path} is empty: its process was killed before it wrote; remove it") from None
     scan = _Scan(data, found, path.suffix != ".mcap", lambda share: show(f"{what} {path.name}", share))
     return found, scan.items()
 
@@ -59,7 +60,7 @@ def goes_on(path: Path, at: int, size: int) -> bool:
 
     Then a record that seems to end behind them has a damaged length: the file is not cut.
     """
-    with path.open("rb") as file, mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
+    with open_log(path) as file, mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
         scan = _Scan(data, Findings(), True, lambda _: None)
         return scan._next(at + 1) < size
 

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from mcap.writer import CompressionType, Writer
-
 from tmc.kernel.config import Journal
 from tmc.record import builders, channels, disk, schemas
 from tmc.record.errors import RecordError
+from tmc.record.mcapwriter import mcap_writer
 
 FORMAT = "1"
 """Version of the log format, in the metadata of each file."""
@@ -69,7 +68,7 @@ class LogWriter:
                 self._old = held.pop_all()
         except OSError as error:
             raise RecordError(disk.unwritable(self.path, error)) from None
-        self._writer = Writer(self._file, journal.chunk, CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
+        self._writer = mcap_writer(self._file, journal.chunk)
         try:
             self._start(dict(metadata), old, name)
         except BaseException:
