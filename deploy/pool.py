@@ -51,15 +51,13 @@ class Worker:
         except OSError:
             raise FailedError(self._how_it_ended()) from None
 
-    def result(self) -> Any:
-        """What it returned, or raise what it raised. Raises FailedError when it died."""
+    def outcome(self) -> tuple[bool, Any]:
+        """True and what it returned, or False and what it raised. Raises FailedError when it died."""
         try:
             good, value = self.connection.recv()
         except (EOFError, OSError):
             raise FailedError(self._how_it_ended()) from None
-        if not good:
-            raise value
-        return value
+        return good, value
 
     def _how_it_ended(self) -> str:
         how = process.how_it_ended(self.process.wait())
@@ -78,16 +76,16 @@ class Worker:
 def call_each(function: Callable[[A], R], arguments: Sequence[A], jobs: int) -> Iterator[R]:
     """Yield `function(a)` for each argument in order, computed on `jobs` processes.
 
-    Raises what the function raises, and FailedError, which says how, when a process dies.
+    Raises what the function raises, in its turn, and FailedError, which says how, when a process dies.
     """
     workers: list[Worker] = []
     suspension = Suspension(lambda: [worker.process.pid for worker in workers])
-    waiting, results = iter(enumerate(arguments)), dict[int, R]()
+    waiting, outcomes = iter(enumerate(arguments)), dict[int, tuple[bool, Any]]()
     try:
         workers += [Worker() for _ in range(min(jobs, len(arguments)))]
         idle, busy = [*workers], dict[Any, Worker]()
         for number in range(len(arguments)):
-            while number not in results:
+            while number not in outcomes:
                 suspension.take()
                 while idle and (item := next(waiting, None)) is not None:
                     worker = idle.pop()
@@ -95,9 +93,12 @@ def call_each(function: Callable[[A], R], arguments: Sequence[A], jobs: int) -> 
                     busy[worker.connection] = worker
                 for connection in wait([*busy], POLL_S):
                     worker = busy.pop(connection)
-                    results[worker.item] = worker.result()
+                    outcomes[worker.item] = worker.outcome()
                     idle.append(worker)
-            yield results.pop(number)
+            good, value = outcomes.pop(number)
+            if not good:
+                raise value
+            yield value
     finally:
         suspension.close()
         for worker in workers:

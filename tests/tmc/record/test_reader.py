@@ -153,7 +153,7 @@ def test_a_schema_that_only_the_file_knows(tmp_path):
 
 
 def test_what_is_no_log_is_refused_with_the_mend(tmp_path):
-    with pytest.raises(RecordError, match=r"gone.mcap cannot be read \(No such file.*check the path"):
+    with pytest.raises(RecordError, match=r"gone.mcap cannot be read \(No such file.*give the file"):
         Log(tmp_path / "gone.mcap")
     with pytest.raises(RecordError, match=r"cannot be read \(Is a directory\)"):
         read(tmp_path)
