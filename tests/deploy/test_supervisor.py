@@ -288,6 +288,8 @@ def test_processes_are_forked_from_one_that_has_no_threads(tmp_path: Path) -> No
             "forkserver-learner": 1,
         }
         assert plan.preload == {"actors": ("actors.policy",)}
+        said = [log.read_text() for log in (tmp_path / "logs").glob("forkserver-*.txt")]
+        assert not [text for text in said if "threads run after importing" in text], "what is preloaded was left out"
     finally:
         supervisor.stop()
         supervisor.close()
