@@ -281,7 +281,7 @@ def test_processes_are_forked_from_one_that_has_no_threads(tmp_path: Path) -> No
     supervisor = Supervisor(plan, tmp_path, 1, lambda _: None)
     supervisor.start()
     try:
-        watch_until(supervisor, lambda: {"uav-000", "learner"} <= set(supervisor.pids()), 60.0)
+        watch_until(supervisor, lambda: {"uav-000", "learner"} <= set(supervisor.pids()))
         pids = supervisor.pids()
         assert {name: threads_of(pids[name]) for name in ("forkserver-actors", "forkserver-learner")} == {
             "forkserver-actors": 1,
