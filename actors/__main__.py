@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from pathlib import Path
@@ -15,9 +14,11 @@ from actors.service import Left, Service
 from tmc.kernel.config import ConfigError
 from tmc.kernel.policy import PolicyError
 from tmc.kernel.roadmap import MapError
+from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.wire import process
 from tmc.wire.fields import FieldError
+from tmc.wire.options import Options
 from tmc.wire.sockets import EndpointError
 
 MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError, FieldError, MemoryError)
@@ -30,7 +31,7 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
     try:
         service.fly(stop)
     except Left as left:
-        service.leave(str(left))
+        service.leave(printable(left))
         if left.code not in {process.DONE, process.STOPPED}:
             process.tell(f"UAV {uav}: {left}")
         return stop.code if left.code == process.STOPPED else left.code
@@ -43,7 +44,7 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the options of a child process and fly."""
-    parser = argparse.ArgumentParser("actors", description=__doc__)
+    parser = Options("actors", description=__doc__)
     parser.add_argument("--id", type=int, required=True, help="number of the UAV, from 0")
     parser.add_argument("--connect", required=True, help="the TMC's endpoint for UAVs")
     parser.add_argument("--out", type=Path, required=True, help="folder for the UAV's log")

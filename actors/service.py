@@ -101,7 +101,7 @@ class Service:
         hello = m.Hello("uav", self.uav, self.life)
         while not stop():
             if self.reminder.due():
-                process.note(f"UAV {self.uav} waits for a TMC at {self.endpoint}")
+                process.note(f"UAV {self.uav} waits for a TMC at {sockets.waiting(self.endpoint)}")
             self.say(hello)
             if self.sock.poll(int(SILENCE[0] * 1000)):
                 message = self._receive()

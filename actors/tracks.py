@@ -8,14 +8,20 @@ writes the same words again. Whoever waits for a UAV says in that row for which 
 from __future__ import annotations
 
 import ctypes
+import errno
 import mmap
 import os
 from pathlib import Path
+from typing import IO
 
 from actors import futex
 
 _HEAD = 2
 """Words of a row before its slots: the newest position, and the first tick that somebody waits for (0: nobody does)."""
+
+_NOT_KNOWN = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
+"""Errors of a file system that cannot reserve room: there, zeros are written."""
+_PIECE = 2**20
 
 
 class TrackTable:
@@ -28,21 +34,36 @@ class TrackTable:
 
 
 def create_table(path: Path, team: int, ticks: int) -> None:
-    """A table file of zeros, which other processes then open; refuses a path that exists."""
+    """A table file of zeros, which other processes then open; refuses a path that exists. OSError without the room.
+
+    Its room is taken now: a process that writes into a page for which there is none is killed by SIGBUS.
+    """
     with path.open("xb") as file:
-        file.truncate(_bytes(team, ticks))
+        reserve(file, table_bytes(team, ticks))
+
+
+def reserve(file: IO[bytes], size: int) -> None:
+    """Give a new file so many bytes of zeros, and the room that they take."""
+    try:
+        os.posix_fallocate(file.fileno(), 0, size)
+    except (AttributeError, OSError) as error:
+        if getattr(error, "errno", errno.EOPNOTSUPP) not in _NOT_KNOWN:
+            raise
+        for first in range(0, size, _PIECE):
+            file.write(bytes(min(_PIECE, size - first)))
 
 
 def open_table(path: Path, team: int, ticks: int) -> TrackTable:
     """Map the table that the TMC made; raises OSError or ValueError when it is not there or has another size."""
     with path.open("r+b") as file:
         size = os.fstat(file.fileno()).st_size
-        if size != _bytes(team, ticks):
-            raise ValueError(f"the track table {path} has {size} bytes, expected {_bytes(team, ticks)}")
+        if size != table_bytes(team, ticks):
+            raise ValueError(f"the track table {path} has {size} bytes, expected {table_bytes(team, ticks)}")
         return TrackTable(team, ticks, memoryview(mmap.mmap(file.fileno(), size)))
 
 
-def _bytes(team: int, ticks: int) -> int:
+def table_bytes(team: int, ticks: int) -> int:
+    """The size of a table."""
     return 8 * team * (ticks + 1 + _HEAD)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 
 from tmc.wire import process
+from tmc.wire.options import Options
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class _Version(argparse.Action):
 
 def parser_for(chosen: str | None) -> argparse.ArgumentParser:
     """The parser; only the chosen command's module is imported for its options."""
-    parser = argparse.ArgumentParser("overfly", description="A team of UAV processes learns to patrol a road network.")
+    parser = Options("overfly", description="A team of UAV processes learns to patrol a road network.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in COMMANDS:

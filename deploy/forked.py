@@ -148,4 +148,4 @@ def forkserver_command(package: str, out: Path, preload: Sequence[str], room: in
     """The command line of the forkserver of `package`, with `room` characters for the command line of a child."""
     loads = [word for module in preload for word in ("--preload", module)]
     command = (sys.executable, "-P", "-m", "deploy.forkserver", "--of", package)
-    return (*command, "--out", str(out), "--parent", str(os.getpid()), *loads, "--room", "." * room)
+    return (*command, f"--out={out.absolute()}", "--parent", str(os.getpid()), *loads, "--room", "." * room)

@@ -27,6 +27,7 @@ from typing import Any, NoReturn
 
 from deploy import extras
 from tmc.wire import process
+from tmc.wire.options import Options
 
 TITLE = ("python", "-P", "-m")
 """What a command line begins with, for `ps` and whoever else looks for it; the name of the package follows."""
@@ -144,7 +145,7 @@ def set_title(words: tuple[str, ...]) -> None:
         return
     fields = Path("/proc/self/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
     start, end = int(fields[45]), int(fields[46])
-    text = b"\0".join(word.encode() for word in words)[: max(end - start - 1, 0)]
+    text = b"\0".join(os.fsencode(word) for word in words)[: max(end - start - 1, 0)]
     if start and text:
         ctypes.memset(start, 0, end - start)
         ctypes.memmove(start, text, len(text))
@@ -183,7 +184,7 @@ def _refuse(sentence: str) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Import, freeze, serve."""
-    parser = argparse.ArgumentParser("deploy.forkserver", description=__doc__)
+    parser = Options("deploy.forkserver", description=__doc__)
     parser.add_argument("--of", required=True, metavar="PACKAGE", help="whose __main__ the processes run")
     parser.add_argument("--preload", action="append", default=[], metavar="MODULE", help="what all of them will need")
     parser.add_argument("--out", default="", help="the run's folder, to be found by")
@@ -191,7 +192,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--room", default="", help="space for the command lines of the processes")
     a = parser.parse_args(argv)
     process.become_child(a.parent)
-    set_title((*TITLE, "deploy.forkserver", "--of", a.of, "--out", a.out, "--parent", str(a.parent)))
+    set_title((*TITLE, "deploy.forkserver", "--of", a.of, f"--out={a.out}", "--parent", str(a.parent)))
     run = _program(a.of, a.preload)
     if process.threads() > 1:
         _do_without(a)

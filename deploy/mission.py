@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import shlex
 import signal
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
-from actors.tracks import create_table
 from deploy import extras, lockstep, plan, who
 from deploy.progress import Observer, Progress
 from deploy.supervisor import MissionFailed, Supervisor
@@ -190,8 +190,9 @@ class Mission:
         self.policy = keep_settings(out, world, policy)
         self.flies = flies or str(self.policy)
         self.progress = progress or Progress(config, self.world.law.cells.size, bound_of(self.world))
-        self._begun, self._start = _told(out), time.time()
+        self._begun, self._began_at, self._start = _told(out), datetime.now(UTC), time.monotonic()
         self._ended: dict[str, Any] = {}
+        self._folder = out.stat()
         self._write_run(self._ended)
 
     def run(self, *, in_one_process: bool) -> int:
@@ -204,6 +205,10 @@ class Mission:
             else:
                 self._fly()
             self._seal()
+        except RecordError:
+            if self._is_there():
+                raise
+            code, said = process.FAILED, self._gone()
         except (MissionFailed, FlightError) as failed:
             which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
             code, said = process.FAILED, f"{failed}{which}"
@@ -222,10 +227,11 @@ class Mission:
         supervisor = Supervisor(mission, self.out, self.config.training.threads, self.progress.note)
         observer = Observer(mission.endpoint)
         try:
-            create_table(mission.tracks, self.config.team.size, self.config.training.ticks)
             supervisor.start()
             while not supervisor.watch():
                 time.sleep(POLL)
+                if not self._is_there():
+                    raise MissionFailed(self._gone())
                 status = observer.ask()
                 if status is not None:
                     self.progress.show(status)
@@ -235,6 +241,16 @@ class Mission:
             supervisor.stop()
             supervisor.close()
             self._ended = {"exit_codes": supervisor.exit_codes(), "restarts": supervisor.restarts()}
+
+    def _is_there(self) -> bool:
+        """False once the run folder was removed or moved: nothing that is flown from then on can be kept."""
+        try:
+            return os.path.samestat(self._folder, self.out.stat())
+        except OSError:
+            return False
+
+    def _gone(self) -> str:
+        return f"the run folder {self.out} was removed or moved while the mission was flown: fly it again"
 
     def _seal(self) -> None:
         """Rewrite the journal of a mission that is over for keeping; its sizes are in `run.json`."""
@@ -247,14 +263,16 @@ class Mission:
 
     def _write_run(self, more: dict[str, Any]) -> None:
         """`run.json`: what was run, and resumed, with which versions, and how each process ended."""
+        if not self._is_there():  # that is said
+            return
         facts = {
             "command": self._begun.get("command", self.command),
             "resumed": [*self._begun.get("resumed", []), *([self.command] if self._begun else [])],
             "overfly": version("overfly"),
             "python": platform.python_version(),
             "platform": platform.platform(),
-            "started": datetime.fromtimestamp(self._start, UTC).isoformat(timespec="seconds"),
-            "seconds": round(time.time() - self._start, 1),
+            "started": self._began_at.isoformat(timespec="seconds"),
+            "seconds": round(time.monotonic() - self._start, 1),
         }
         try:
             disk.put(self.out / "run.json", (json.dumps(facts | more, indent=1) + "\n").encode(), sync=False)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import shutil
 import sys
-import tempfile
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
 import deploy
 from actors.planners import PREFIX
+from deploy import machine, scratch
 from tmc.kernel.config import Config
 
-SCRATCH, HELD = "overfly-", "held"
-"""How the names of the folders begin that the processes of a mission share, and the file in each."""
 ROOT = Path(deploy.__file__).resolve().parent.parent
 """The folder that holds the four packages."""
 
@@ -56,47 +51,34 @@ class Plan:
 def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) -> Plan:
     """TMC, N UAVs and, unless a fixed policy or a planner flies, the learner; sockets lie in a folder of their own.
 
-    `table`: the UAVs share a table of tracks; otherwise they tell each other by beacon.
+    `table`: the UAVs share a table of tracks; otherwise they tell each other by beacon. Paths are handed on whole, and
+    as one word with their option, since a name may begin with a dash. Raises ConfigError where this machine lacks what
+    the mission needs.
     """
-    scratch, held = _new_scratch()
-    endpoint, tracks = f"ipc://{scratch}/sync", scratch / "tracks"
-    flies_fixed = policy is not None or config.team.pilot != "policy"
+    learns = policy is None and config.team.pilot == "policy"
+    machine.require(config, learns=learns, out=out)
+    out, shared = out.absolute(), scratch.make(config, table=table)
     tmc = [sys.executable, "-P", "-m", "tmc"]  # -P: the user's folder may hold packages of the same names
-    tmc += ["--config", str(out / "config.json"), "--bind", endpoint, "--resume"]
-    tmc += ["--parent", str(os.getpid()), "--out", str(out)]
-    tmc += ["--tracks", str(tracks)] if table else []
-    tmc += ["--policy", str(policy)] if policy else []
+    tmc += [f"--config={out / 'config.json'}", "--bind", shared.endpoint, "--resume"]
+    tmc += ["--parent", str(os.getpid()), f"--out={out}"]
+    tmc += [f"--tracks={shared.tracks}"] if table else []
+    tmc += [f"--policy={policy.absolute()}"] if policy else []
     children = [Child("tmc", tuple(tmc), restart=True, leads=True)]
-    common = ("--connect", endpoint, "--out", str(out))
-    if not flies_fixed:
+    common = ("--connect", shared.endpoint, f"--out={out}")
+    if learns:
         children.append(Child("learner", common, restart=True, fork_of="learner"))
     for i in range(config.team.size):
         children.append(Child(f"uav-{i:03d}", ("--id", str(i), *common), restart=True, fork_of="actors"))
     # A planner flies without ONNX Runtime, 16 MB of memory that nobody would use.
     preload = {} if config.team.pilot.startswith(PREFIX) else {"actors": ("actors.policy",)}
-    return Plan(tuple(children), endpoint, tracks, scratch, preload, held)
+    return Plan(tuple(children), shared.endpoint, shared.tracks, shared.folder, preload, shared.held)
 
 
-def _new_scratch() -> tuple[Path, IO[bytes]]:
-    """A folder for what the processes share, and the file in it that is held while its supervisor lives.
-
-    The folders of supervisors that were killed are removed: nobody holds their files any more.
-    """
-    for old in Path(_short_folder() or tempfile.gettempdir()).glob(f"{SCRATCH}*/{HELD}"):
-        with suppress(OSError), old.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(old.parent)
-    scratch = Path(tempfile.mkdtemp(prefix=SCRATCH, dir=_short_folder()))
-    held = (scratch / ".new").open("wb")
-    fcntl.flock(held, fcntl.LOCK_EX)
-    (scratch / ".new").rename(scratch / HELD)
-    return scratch, held
-
-
-def _short_folder() -> str | None:
-    """Memory-backed where there is such a folder: the track table must not wait for a disk."""
-    shm = Path("/dev/shm")
-    return str(shm) if shm.is_dir() and os.access(shm, os.W_OK) else None
+def check_machine(config: Config, *, learns: bool, out: Path | None) -> None:
+    """Raise ConfigError where this machine lacks what a mission needs, before anything of it is written."""
+    machine.require(config, learns=learns, out=out or Path())
+    with scratch.made(config):
+        pass
 
 
 # TMC and learner free and take the same large blocks for every minibatch: keep them instead of returning them to the

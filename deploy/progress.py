@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from typing import Any, TextIO
 
 import zmq
 
+from deploy.line import Line, Part
 from tmc.kernel.config import Config
 from tmc.wire import messages as m
-from tmc.wire import sockets
+from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
-
-PLAIN_EVERY = 5.0
-"""Seconds between two lines where the output is no terminal."""
 
 
 class Observer:
@@ -45,38 +42,34 @@ class Progress:
 
     def __init__(self, config: Config, cells: int, bound: float, out: TextIO | None = None) -> None:
         self.config, self.cells, self.bound = config, cells, bound
-        self._out = out or sys.stderr
-        self._tty = self._out.isatty()
+        self._line = Line(out)
         self._total = config.training.episodes * config.training.ticks
         self._past: list[tuple[float, int, int]] = []
-        self._next = self._width = self._working = 0.0
+        self._working = 0.0
 
     def show(self, status: m.Status) -> None:
         """Show a status, when it is time to."""
-        now = time.monotonic()
-        self._past = [*self._past[-120:], (now, status.ticks, status.updates)]
-        if now < self._next:
-            return
-        self._next = now + (0.2 if self._tty else PLAIN_EVERY)
-        self._write(self.line(status))
+        self._past = [*self._past[-120:], (time.monotonic(), status.ticks, status.updates)]
+        if self._line.due():
+            self._line.say(*self.parts(status))
 
-    def line(self, s: m.Status) -> str:
-        """One status as text."""
+    def parts(self, s: m.Status) -> list[Part]:
+        """One status as pieces of a line: where it is, what it waits for and how long it takes are wanted most."""
         if s.phase == "gathering":
-            return f"waiting for {s.waiting or 'the first tick'}"
+            return [(0, f"waiting for {s.waiting or 'the first tick'}")]
         ticks, updates = self._rates()
-        parts = [f"episode {s.episode}/{self.config.training.episodes}", f"tick {s.ticks:,}/{self._total:,}"]
-        parts += [f"{ticks:,.0f} ticks/s"]
-        parts += [f"{updates:,.0f} updates/s"] if s.updates else []
-        parts += [f"uncertainty {s.uncertainty / self.cells:.3f} a cell"]
+        parts = [(2, f"episode {s.episode}/{self.config.training.episodes}"), (0, f"tick {s.ticks:,}/{self._total:,}")]
+        parts += [(6, f"{ticks:,.0f} ticks/s")]
+        parts += [(7, f"{updates:,.0f} updates/s")] if s.updates else []
+        parts += [(5, f"uncertainty {s.uncertainty / self.cells:.3f} a cell")]
         if s.episode_uncertainty:
             times = f" ({s.episode_uncertainty / self.bound:.2f} x bound)" if self.bound else ""
-            parts += [f"last episode {s.episode_uncertainty / self.cells:.3f}{times}"]
+            parts += [(8, f"last episode {s.episode_uncertainty / self.cells:.3f}{times}")]
         left = self._total - s.ticks
-        parts += [f"{clock(left / ticks)} left"] if ticks > 0 and left else []
-        parts += ["the learner catches up"] if s.phase == "learning" else []
-        parts += [f"waiting for {s.waiting}"] if s.waiting and self._stands_still() else []
-        return " · ".join(parts)
+        parts += [(3, f"{clock(left / ticks)} left")] if ticks > 0 and left else []
+        parts += [(4, "the learner catches up")] if s.phase == "learning" else []
+        parts += [(1, f"waiting for {s.waiting}")] if s.waiting and self._stands_still() else []
+        return parts
 
     def _rates(self) -> tuple[float, float]:
         """Ticks and updates a second over the last half minute."""
@@ -96,30 +89,16 @@ class Progress:
         """Show how much of something is done that comes after the flight, once it has taken some time."""
         now = time.monotonic()
         self._working = self._working or now
-        if now > max(self._next, self._working + 2.0):
-            self._next = now + (0.2 if self._tty else PLAIN_EVERY)
-            self._write(f"{what}: {share:.0%}")
+        if now > self._working + 2.0:
+            self._line.share(what, share)
 
     def note(self, text: str) -> None:
         """A line that stays."""
-        self.clear()
-        print(f"overfly: {text}", file=self._out, flush=True)
-
-    def _write(self, text: str) -> None:
-        if self._tty:
-            columns = os.get_terminal_size(self._out.fileno()).columns - 1
-            text = text[:columns]
-            self._out.write("\r" + text.ljust(int(self._width)))
-            self._width = len(text)
-            self._out.flush()
-        else:
-            print(text, file=self._out, flush=True)
+        self._line.keep(f"{process.ERROR}{text}")
 
     def clear(self) -> None:
         """End the line that is written over."""
-        if self._tty and self._width:
-            self._out.write("\r" + " " * int(self._width) + "\r")
-            self._width = 0
+        self._line.clear()
 
 
 def clock(seconds: float) -> str:

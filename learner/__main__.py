@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from pathlib import Path
@@ -17,6 +16,7 @@ from tmc.kernel.roadmap import MapError
 from tmc.record.errors import RecordError
 from tmc.wire import process
 from tmc.wire.fields import FieldError
+from tmc.wire.options import Options
 from tmc.wire.sockets import EndpointError
 
 MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, TrainingError, FieldError, MemoryError)
@@ -37,7 +37,7 @@ def learn(endpoint: str, out: Path) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the options of a child process and learn."""
-    parser = argparse.ArgumentParser("learner", description=__doc__)
+    parser = Options("learner", description=__doc__)
     parser.add_argument("--connect", required=True, help="the TMC's endpoint for UAVs; the learner's lies beside it")
     parser.add_argument("--out", type=Path, required=True, help="run folder")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")

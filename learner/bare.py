@@ -143,7 +143,7 @@ def gradient(net: qnet.QNet) -> torch.Tensor:
 
 def main(argv: list[str] | None = None) -> int:
     """Print the updates a second."""
-    parser = argparse.ArgumentParser("learner.bare", description=__doc__)
+    parser = argparse.ArgumentParser("learner.bare", description=__doc__, allow_abbrev=False)
     parser.add_argument("--config", type=Path, required=True, help="settings as JSON, dotted keys")
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--parent", type=int, default=0, help="process to die with")

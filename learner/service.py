@@ -84,7 +84,7 @@ class Service:
         """Say hello until the TMC answers; None when stopped before."""
         while not stop():
             if self.reminder.due():
-                process.note(f"the learner waits for a TMC at {self.endpoint}")
+                process.note(f"the learner waits for a TMC at {sockets.waiting(sockets.feed_endpoint(self.endpoint))}")
             sockets.send(self.sock, m.Hello("learner", -1, self.life, saved.meta.updates if saved else 0))
             if self.sock.poll(1000):
                 message = self._receive()

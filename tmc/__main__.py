@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -22,6 +21,7 @@ from tmc.service import Service
 from tmc.station import Station
 from tmc.wire import capacity, process
 from tmc.wire.fields import FieldError
+from tmc.wire.options import Options
 from tmc.wire.sockets import EndpointError
 
 MISTAKES = (ConfigError, MapError, RecordError, EndpointError, FieldError, MemoryError)
@@ -77,7 +77,7 @@ def take_up(station: Station, journal: Journal) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the options of a child process and serve."""
-    parser = argparse.ArgumentParser("tmc", description=__doc__)
+    parser = Options("tmc", description=__doc__)
     parser.add_argument("--config", type=Path, required=True, help="settings of the mission, JSON")
     parser.add_argument("--bind", required=True, help="endpoint for the UAVs; the learner's lies beside it")
     parser.add_argument("--out", type=Path, required=True, help="run folder")

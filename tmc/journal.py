@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,20 @@ class Journal:
     """The file `tmc.mcap` of a run: config and map as attachments, then one message an entry.
 
     `resume`: go on with the journal that an earlier life of the TMC left in the folder, if it left one (`found`).
+    `timer`: a clock in s that is never set.
     """
 
-    def __init__(self, folder: Path, world: World, run: str, *, resume: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        world: World,
+        run: str,
+        *,
+        resume: bool = False,
+        timer: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.world, self.folder = world, folder
+        self._timer, self._started = timer, timer()
         self.found = resume and journal_in(folder) is not None
         self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run}, resume=resume)
         self._policies: set[int] = set()
@@ -99,7 +109,10 @@ class Journal:
         if entry.topic == "/tmc/last_visit":
             grid, cell = self.world.grid, self.world.map.cell_m
             return builders.grid(entry.values["last_visit"], grid.rows, grid.cols, cell, time.time_ns())
-        return message_class(_SCHEMA[entry.topic])(**entry.values)
+        message = message_class(_SCHEMA[entry.topic])(**entry.values)
+        if entry.topic == "/tmc/metrics":
+            message.elapsed = self._timer() - self._started
+        return message
 
 
 def journal_in(folder: Path) -> Path | None:

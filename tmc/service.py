@@ -48,7 +48,7 @@ class Service:
     """Binds both sockets, and serves until the mission is over or `stop` says so."""
 
     def __init__(self, station: Station, journal: Journal, endpoint: str) -> None:
-        self.station, self.journal = station, journal
+        self.station, self.journal, self.endpoint = station, journal, endpoint
         self.context: zmq.Context[Any] = zmq.Context()
         self.sync = sockets.router(self.context, endpoint)
         self.feed = sockets.router(self.context, sockets.feed_endpoint(endpoint))
@@ -257,4 +257,6 @@ class Service:
     def close(self) -> None:
         """Close the sockets and the journal."""
         self.context.destroy(linger=200)
+        for endpoint in (self.endpoint, sockets.feed_endpoint(self.endpoint)):
+            sockets.unlink(endpoint)
         self.journal.writer.close()

@@ -176,8 +176,8 @@ def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
 def _idle(out: Path, seconds: float) -> float | None:
     """The mean idle share that the learner logged in the last `seconds`."""
     path = run_files(out).get("learner")
-    told = [(raw.log_time, decode(raw)) for raw in Log(path).raw() if raw.topic == "/learner/metrics"] if path else []
-    shares = [metrics.idle_share for at, metrics in told if at > told[-1][0] - seconds * 1e9]
+    told = [decode(raw) for raw in Log(path).raw() if raw.topic == "/learner/metrics"] if path else []
+    shares = [metrics.idle_share for metrics in told if metrics.wall > told[-1].wall - seconds]
     return sum(shares) / len(shares) if shares else None
 
 

@@ -174,7 +174,7 @@ def _exchanges(world: World, episode: int) -> Iterator[tuple[int, Rows, NDArray[
 
 def main() -> int:
     """The process that is measured: settings as JSON on stdin, figures as JSON on stdout."""
-    parser = argparse.ArgumentParser("deploy.benches.replay", description=__doc__)
+    parser = argparse.ArgumentParser("deploy.benches.replay", description=__doc__, allow_abbrev=False)
     parser.add_argument("--minibatches", type=int, required=True)
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
     a = parser.parse_args()

@@ -21,7 +21,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from actors.tracks import create_table
 from deploy import lockstep, plan, settings, who
 from deploy.benches import bounds
 from deploy.benches.row import Row
@@ -174,8 +173,6 @@ def started(
     supervisor = Supervisor(mission, out, config.training.threads, _say)
     observer = Observer(mission.endpoint)
     try:
-        if table:
-            create_table(mission.tracks, config.team.size, config.training.ticks)
         supervisor.start()
         yield supervisor, observer
     finally:
@@ -220,17 +217,17 @@ def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -
     times, beacons = [], 0
     for raw in Log(files["tmc"]).raw():
         if raw.topic == "/tmc/metrics":
-            times.append(raw.log_time)
+            times.append((raw.log_time, decode(raw).elapsed))
         elif raw.topic == "/log":
             said = re.search(r"\bBeacon ([0-9]+)", decode(raw).message)
             beacons += int(said[1]) if said else 0
     steps = config.team.size * config.training.ticks * config.training.episodes
-    seconds = (times[-1] - times[0]) / 1e9
+    seconds = times[-1][1] - times[0][1]
     uavs = [path for name, path in files.items() if name.startswith("uav-")]
     return Flown(
         steps / seconds if seconds else math.nan,
-        (times[0] - start) / 1e9,
-        _waits(uavs, times[0]),
+        (times[0][0] - start) / 1e9,
+        _waits(uavs, times[0][0]),
         beacons / steps,
         memory,
     )

@@ -12,7 +12,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from actors.tracks import create_table
 from deploy import plan
 from deploy.chaos.blows import CUT, KILL, POWER, STOP, Blow, role
 from deploy.chaos.judge import Snapshot
@@ -63,7 +62,6 @@ class Disturbed(Mission):
         self.supervisor = Supervisor(self.wire.plan, self.out, self.config.training.threads, self.storm.note)
         self.observer = Observer(self.plan.endpoint)
         try:
-            create_table(self.plan.tracks, self.config.team.size, self.config.training.ticks)
             self.supervisor.start()
             self._weather()
         except Over:

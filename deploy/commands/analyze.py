@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 from deploy import extras
+from tmc.analysis import pictures as drawing
 from tmc.analysis import report as reports
 from tmc.analysis.flown import Flown, read
 from tmc.analysis.metrics import summarize
 from tmc.analysis.summary import Summary
 from tmc.kernel.config import ConfigError
 from tmc.record import disk
-from tmc.record.errors import RecordError
+from tmc.wire import process
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,15 +63,19 @@ def report(
 ) -> int:
     """Print the summary, and keep it as RUN/summary.json with RUN/report/*.png; RecordError when RUN holds no flight.
 
-    What cannot be written is said, and is no failure: the summary is there to be read.
+    What cannot be written is said, and is no failure: the summary is there to be read. Pictures come last, so that none
+    that fails can take the result along.
     """
     flown = read(run)
     summary = summarize(flown)
     if episode is not None:
         flown.episode(episode)
     kept = _keep(run / "summary.json", summary.to_json() + "\n", pictures=pictures)
-    made = _draw(flown, summary, episode, baselines or {}) if pictures and kept else []
-    print(summary.to_json() if as_json else reports.text(summary, made, kept=kept))
+    wanted = pictures and kept
+    print(summary.to_json() if as_json else reports.text(summary, int(wanted), kept=kept), flush=True)
+    made = _draw(flown, summary, episode, baselines or {}) if wanted else []
+    if made and not as_json:
+        print(reports.pictures(made))
     return 0
 
 
@@ -81,26 +85,14 @@ def _keep(path: Path, text: str, *, pictures: bool) -> bool:
         disk.put(path, text.encode(), sync=False)
     except OSError as error:
         lost = "the summary is printed only" + (", and no pictures are made" if pictures else "")
-        print(f"overfly: {path} cannot be written ({error.strerror}): {lost}", file=sys.stderr)
+        process.tell(f"{path} cannot be written ({error.strerror}): {lost}")
         return False
     return True
 
 
 def _draw(flown: Flown, summary: Summary, episode: int | None, lines: Mapping[str, float]) -> list[Path]:
-    """The pictures; none, and a sentence on stderr, without matplotlib."""
-    why = extras.lacking(extras.FIGURES)
-    if not why:
-        try:
-            from tmc.analysis import figures  # noqa: PLC0415  half a second, and an extra
-        except Exception as error:
-            why = extras.broken(error)
-            if not why:
-                raise
-    if why:
-        print(f"overfly: no pictures: {why}", file=sys.stderr)
+    """The pictures that can be made; a sentence on stderr for each other."""
+    if why := extras.lacking(extras.FIGURES):
+        process.tell(f"no pictures: {why}")
         return []
-    try:
-        return figures.draw(flown, summary, episode, lines)
-    except RecordError as error:
-        print(f"overfly: no pictures: {error}", file=sys.stderr)
-        return []
+    return drawing.draw(flown, summary, episode, lines, process.tell, extras.broken)

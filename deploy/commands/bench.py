@@ -14,7 +14,7 @@ from deploy import extras
 from deploy.benches import cores
 from deploy.benches.row import finite, machine, text
 from deploy.supervisor import MissionFailed
-from tmc.wire.process import FAILED
+from tmc.wire.process import FAILED, tell
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         rows = importlib.import_module(bench.module).measure(args)
     except MissionFailed as failed:
-        print(f"overfly: {failed}", file=sys.stderr)
+        tell(str(failed))
         return FAILED
     except subprocess.CalledProcessError as failed:  # what it had to say stands above
         code = failed.returncode

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from deploy import extras, settings
 from tmc.kernel.config import SETTINGS, flat
+from tmc.kernel.text import printable
 from tmc.kernel.world import World
 
 
@@ -31,10 +32,10 @@ def main(args: argparse.Namespace) -> int:
         fine &= _package(package)
     for what, look in CHECKS.items():
         try:
-            print(f"  ok    {what}: {look()}")
+            print(printable(f"  ok    {what}: {look()}"))
         except Exception as error:  # whatever is wrong here is what the doctor is for
             fine = False
-            print(f"  BAD   {what}: {error}")
+            print(printable(f"  BAD   {what}: {error}"))
     print("all is well" if fine else "something is wrong: see the lines with BAD")
     return 0 if fine else 1
 

@@ -18,6 +18,7 @@ from deploy.mission import bound_of, check
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.policy import FlightError
 from tmc.kernel.roadmap import builtin_maps, load_map
+from tmc.kernel.text import printable
 from tmc.kernel.world import World
 from tmc.roster import Outbox
 from tmc.wire.process import FAILED
@@ -209,7 +210,8 @@ def text(rows: list[Row], config: Config) -> str:
     """The table for a person."""
     scenario, ticks = config.scenario, config.training.ticks
     lines = [
-        f"Mean uncertainty a road cell: {ticks:,} ticks, scenario {scenario}, T_u = {config.T_u}, {config.world.map};",
+        f"Mean uncertainty a road cell: {ticks:,} ticks, scenario {scenario}, T_u = {config.T_u}, "
+        f"{printable(config.world.map)};",
         f"mean of {rows[0].seeds} seeds with its 95 % interval. x bound: against a lower bound that no team can beat.",
         "blocked: moves refused in a mission; collisions: those of them that another UAV stood in the way of.",
         "",
@@ -218,7 +220,8 @@ def text(rows: list[Row], config: Config) -> str:
     for r in rows:
         times = "-" if math.isnan(r.times_bound) else f"{r.times_bound:.3f}"
         spread = "" if math.isnan(r.interval) else f" ± {r.interval:.4f}"
-        name = r.who if len(r.who) <= 32 else "…" + r.who[-31:]
+        who = printable(r.who)
+        name = who if len(who) <= 32 else "…" + who[-31:]
         lines.append(
             f"{name:<32} {r.actors:>3} {f'{r.uncertainty:.4f}{spread}':>18} {times:>8} {r.collisions:>11.1f} "
             f"{r.blocked:>8.1f} {r.seconds:>8.1f}"

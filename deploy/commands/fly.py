@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from deploy import extras, mission, settings, who
+from deploy import extras, mission, plan, settings, who
 from deploy.commands.analyze import report
 from deploy.commands.run import add_mission_options
 from tmc.kernel.config import build
@@ -23,6 +23,8 @@ def main(args: argparse.Namespace) -> int:
     pilot = who.resolve(args.who)
     values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args), **who.pilot_of(pilot)}
     world = mission.check(build(values), pilot.policy, pilot.name)
+    if not args.lockstep:
+        plan.check_machine(world.config, learns=False, out=args.out)
     out = mission.new_folder(args.out, "fly")
     flight = mission.Mission(world, out, mission.command_line(), pilot.policy, flies=pilot.name)
     code = flight.run(in_one_process=args.lockstep)

@@ -10,10 +10,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from deploy.commands import log_check, log_export
+from tmc.kernel.text import printable
 from tmc.record import facts
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, info, logs_in, run_files
-from tmc.wire.process import DONE, FAILED
+from tmc.wire.process import DONE, FAILED, tell
 
 JOURNAL_VIEWS = ("moves", "uncertainty", "events", "digest")
 VIEWS = ("info", "cat", "moves", "uncertainty", "events", "digest")
@@ -59,7 +60,7 @@ def main(args: argparse.Namespace) -> int:
     except RecordError as error:
         raise RecordError(f"{error} ({damage})" if damage else str(error)) from None
     if damage:
-        print(f"overfly: this is not all of it: {damage}", file=sys.stderr)
+        tell(f"this is not all of it: {damage}")
     return 1 if damage else code
 
 
@@ -74,16 +75,16 @@ def _damage(run: Path) -> str | None:
 
 def _info(args: argparse.Namespace) -> int:
     rows = []
-    for process, path in logs_in(args.run).items():
+    for role, path in logs_in(args.run).items():
         found = info(path)
         for name, topic in found.topics.items():
-            rows.append({"process": process, "topic": name, "schema": topic.schema, "messages": topic.count})
+            rows.append({"process": role, "topic": name, "schema": topic.schema, "messages": topic.count})
         if found.damage:
-            print(f"overfly: {path}: {found.damage}", file=sys.stderr)
+            tell(f"{path}: {found.damage}")
         if not args.json:
-            print(f"{process}  {path}  {found.bytes:,} bytes  {_when(found.first)} to {_when(found.last)}")
+            print(printable(f"{role}  {path}  {found.bytes:,} bytes  {_when(found.first)} to {_when(found.last)}"))
             for name, topic in found.topics.items():
-                print(f"  {topic.count:>9,}  {name:<24} {topic.schema}")
+                print(printable(f"  {topic.count:>9,}  {name:<24} {topic.schema}"))
     if args.json:
         print(json.dumps(rows, indent=1))
     return 0
@@ -106,7 +107,7 @@ def _cat(args: argparse.Namespace) -> int:
             print(json.dumps(head | {"message": body}))
         damage += [log.damage] if log.damage and not log.still_open else []
     for text in damage:
-        print(f"overfly: this is not all of it: {text}", file=sys.stderr)
+        tell(f"this is not all of it: {text}")
     if wanted and not damage:
         raise RecordError(
             f"{args.run} holds nothing on {', '.join(sorted(wanted))}: `overfly log info` lists its topics"

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from deploy.commands.log_export import fresh
-from deploy.progress import PLAIN_EVERY
+from deploy.line import Line
 from tmc.analysis import check
+from tmc.kernel.text import printable
 from tmc.record.errors import NoLogError, RecordError
 from tmc.record.reader import logs_in
 from tmc.record.recover import Recovery, recover
 from tmc.record.seal import seal_run
-from tmc.wire.process import DONE, FAILED, USAGE
+from tmc.wire.process import DONE, FAILED, USAGE, tell
 
+PATIENCE_S = 2.0
+"""Time before the first word of progress."""
 LOSS = 3
 """Exit code: done, but something is lost."""
 ABOUT = {
@@ -38,24 +40,12 @@ def add_options(view: str, parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
 
 
-class _Progress:
-    """Says every few seconds what is done, once it has taken two."""
-
-    def __init__(self) -> None:
-        self._every = 2.0 if sys.stderr.isatty() else PLAIN_EVERY
-        self._next = time.monotonic() + 2.0
-
-    def __call__(self, what: str, share: float) -> None:
-        if time.monotonic() >= self._next:
-            self._next = time.monotonic() + self._every
-            print(f"{what}: {share:.0%}", file=sys.stderr, flush=True)
-
-
 def _check(args: argparse.Namespace) -> int:
     start = time.monotonic()
-    result = check.check(args.run, _Progress())
-    print("\n".join(result.table()))
-    print(f"\n{result.summary()} in {time.monotonic() - start:.1f} s")
+    with Line(delay=PATIENCE_S) as line:
+        result = check.check(args.run, line.share)
+    print("\n".join(map(printable, result.table())))
+    print(f"\n{printable(result.summary())} in {time.monotonic() - start:.1f} s")
     return DONE if result.good else FAILED
 
 
@@ -63,36 +53,38 @@ def _recover(args: argparse.Namespace) -> int:
     if args.out is not None and os.path.isdir(args.run):  # noqa: PTH112  never raises
         raise RecordError(f"--out is for one file, and {args.run} is a folder: leave it out, or name the file")
     fresh(args.out)
-    paths, show = logs_in(args.run).values(), _Progress()
-    codes = {_recover_one(path, args, show) for path in paths}
+    codes = {_recover_one(path, args) for path in logs_in(args.run).values()}
     if codes == {USAGE}:
         return USAGE
     return FAILED if codes & {USAGE, FAILED} else max(codes)
 
 
-def _recover_one(path: Path, args: argparse.Namespace, show: _Progress) -> int:
+def _recover_one(path: Path, args: argparse.Namespace) -> int:
     try:
-        result: Recovery = recover(path, args.out, in_place=args.in_place, show=show)
+        with Line(delay=PATIENCE_S) as line:
+            result: Recovery = recover(path, args.out, in_place=args.in_place, show=line.share)
     except RecordError as error:
         return _failed(error)
-    print("\n".join(result.lines()))
+    print("\n".join(map(printable, result.lines())))
     return DONE if result.clean else LOSS
 
 
 def _failed(error: RecordError) -> int:
     """Say it; what is not a log at all is a mistake in the command, as everywhere."""
-    print(f"overfly: {error}", file=sys.stderr)
+    tell(str(error))
     return USAGE if isinstance(error, NoLogError) else FAILED
 
 
 def _seal(args: argparse.Namespace) -> int:
     try:
-        sealed = seal_run(args.run, _Progress())
+        with Line(delay=PATIENCE_S) as line:
+            sealed = seal_run(args.run, line.share)
     except RecordError as error:
         return _failed(error)
     for file in sealed:
         torn = f"; a torn end of {file.dropped:,} bytes was dropped" if file.dropped else ""
-        print(f"{file.path}: {file.before:,} bytes before, {file.after:,} after, {file.messages:,} messages{torn}")
+        sizes = f"{file.before:,} bytes before, {file.after:,} after, {file.messages:,} messages"
+        print(printable(f"{file.path}: {sizes}{torn}"))
     before, after = sum(f.before for f in sealed), sum(f.after for f in sealed)
     print(f"{len(sealed)} files: {before:,} bytes before, {after:,} after ({after / before:.0%})")
     return LOSS if any(file.dropped for file in sealed) else DONE

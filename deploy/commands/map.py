@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deploy import extras
+from tmc.analysis.pictures import PictureError, draw_map
 from tmc.kernel.rastertext import COMMENT, raster_text
 from tmc.kernel.roadmap import OBSTACLES, ROADS, MapError, RoadMap, builtin_maps, check, load_map
+from tmc.kernel.text import printable
 
 DEFAULT = "downtown-toronto"
 ABOUT = {
@@ -65,7 +67,7 @@ def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
     print(drawing(road_map))
     if out is not None:
         _picture(road_map, out)
-        print(f"{COMMENT} picture: {out}")
+        print(printable(f"{COMMENT} picture: {out}"))
     return 0
 
 
@@ -84,9 +86,10 @@ def drawing(road_map: RoadMap) -> str:
 
 
 def _picture(road_map: RoadMap, out: Path) -> None:
-    from tmc.analysis.figures import map_picture  # noqa: PLC0415  half a second, and an extra
-
-    map_picture(road_map, out)
+    try:
+        draw_map(road_map, out, extras.broken)
+    except PictureError as error:
+        raise MapError(f"the picture {out} could not be made: {error}") from None
 
 
 def _export(road_map: RoadMap, _args: argparse.Namespace) -> int:
@@ -96,7 +99,7 @@ def _export(road_map: RoadMap, _args: argparse.Namespace) -> int:
 
 def _check(road_map: RoadMap, _args: argparse.Namespace) -> int:
     findings = check(road_map)
-    print("\n".join(findings) if findings else f"{road_map.name} is fine")
+    print("\n".join(map(printable, findings or [f"{road_map.name} is fine"])))
     return 1 if findings else 0
 
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from deploy import extras, mission, settings
+from deploy import extras, mission, plan, settings
 from deploy.commands.analyze import report
 from tmc.kernel.config import ConfigError
 
@@ -37,6 +37,8 @@ def main(args: argparse.Namespace) -> int:
     extras.require(*mission.needs(config, None))
     world = mission.check(config)
     mission.check_training(config)
+    if not args.lockstep:
+        plan.check_machine(config, learns=True, out=args.out)
     out = mission.new_folder(args.out, args.preset)
     code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
     return code or report(out, as_json=args.json, pictures=not args.no_pictures)

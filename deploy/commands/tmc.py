@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from deploy import extras, mission, settings, who
+from deploy import extras, machine, mission, settings, who
 from deploy.progress import Progress
 from tmc.__main__ import serve
 from tmc.kernel.config import Config, ConfigError, build, flat
+from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.seal import seal_log
-from tmc.wire.process import DONE
+from tmc.wire.process import DONE, tell
 from tmc.wire.sockets import check_free
 
 
@@ -47,11 +47,13 @@ def main(args: argparse.Namespace) -> int:
         }
         config, policy, name = build(values), pilot.policy, pilot.name
     world = mission.check(config, policy, name)
+    learns = policy is None and not who.is_planner(config)
     if not name:
         mission.check_training(config)
+    machine.require(config, learns=learns, alone=True, out=args.out or Path())
     out = mission.new_folder(args.out, "tmc")
     path = mission.keep_settings(out, world, policy)
-    print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {out}", flush=True)
+    print(f"overfly: the TMC is at {args.bind}; connect {config.team.size} UAVs; log in {printable(out)}", flush=True)
     return _sealed(serve(config, args.bind, out, policy=path, tracks=""), config, out)
 
 
@@ -64,7 +66,9 @@ def resume(args: argparse.Namespace) -> int:
         raise ConfigError("--resume goes on with the mission's own settings: give it nothing but --bind")
     world, policy = mission.interrupted(args.resume)
     path = mission.flown_policy(args.resume) if policy is not None else None
-    print(f"overfly: the TMC is at {args.bind} again, with the journal in {args.resume}", flush=True)
+    learns = policy is None and not who.is_planner(world.config)
+    machine.require(world.config, learns=learns, alone=True, out=args.resume)
+    print(f"overfly: the TMC is at {args.bind} again, with the journal in {printable(args.resume)}", flush=True)
     code = serve(world.config, args.bind, args.resume, policy=path, tracks="", resume=True)
     return _sealed(code, world.config, args.resume)
 
@@ -76,5 +80,5 @@ def _sealed(code: int, config: Config, out: Path) -> int:
             sealed = seal_log(out / "tmc.mcap", Progress(config, 1, 0.0).work)
             print(f"overfly: the log is sealed: {sealed.before:,} bytes before, {sealed.after:,} after")
         except RecordError as error:
-            print(f"overfly: the log stays as it was written: {error}", file=sys.stderr)
+            tell(f"the log stays as it was written: {error}")
     return code

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -15,8 +14,9 @@ from typing import Any
 
 from deploy import asynchrony, exactness, extras, settings, who
 from deploy.commands import verify_chaos
+from deploy.line import Line
 from deploy.mission import check, new_folder
-from deploy.progress import PLAIN_EVERY, clock
+from deploy.progress import clock
 from tmc.kernel.config import Config, ConfigError
 from tmc.wire import process
 
@@ -59,27 +59,8 @@ def main(args: argparse.Namespace) -> int:
     try:
         return MAINS[args.kind](args)
     except exactness.Stopped as stopped:
-        print(f"overfly: {stopped}", file=sys.stderr)
+        process.tell(str(stopped))
         return process.FAILED
-
-
-class Line:
-    """Progress on stderr: one line that is written over on a terminal, a line now and then elsewhere."""
-
-    def __init__(self) -> None:
-        self._tty, self._next = sys.stderr.isatty(), 0.0
-
-    def write(self, text: str) -> None:
-        if self._tty:
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-        elif time.monotonic() >= self._next:
-            self._next = time.monotonic() + PLAIN_EVERY
-            print(text, file=sys.stderr, flush=True)
-
-    def clear(self) -> None:
-        """Make room for a line that stays."""
-        if self._tty:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -115,14 +96,14 @@ def _exactness(args: argparse.Namespace) -> int:
         for number, config, share in exactness.timed(configs):
             spent = time.monotonic() - start
             left = f" · {clock(spent / share * (1 - share))} left" if share else ""
-            line.write(f"mission {number} of {len(configs)}{left}")
+            line.say(f"mission {number} of {len(configs)}{left}")
             outcome = exactness.verify(config, policy, place / _name(config))
             steps, facts = steps + outcome.steps, facts + outcome.facts
             line.clear()
             _print_row(config, outcome, as_json=args.json)
             if outcome.difference is not None:
-                print(f"overfly: different: {outcome.difference} (processes against lock step); the logs are in "
-                      f"{place / _name(config)}", file=sys.stderr)  # fmt: skip
+                process.tell(f"different: {outcome.difference} (processes against lock step); the logs are in "
+                             f"{place / _name(config)}")  # fmt: skip
                 return process.FAILED
     if not args.json:
         spent = time.monotonic() - start
@@ -184,7 +165,7 @@ def _asynchrony(args: argparse.Namespace) -> int:
     line, good = Line(), True
     with _workplace(args.out) as place:
         for number, trial in enumerate(asynchrony.TRIALS, 1):
-            line.write(f"flight {number} of {len(asynchrony.TRIALS)}")
+            line.say(f"flight {number} of {len(asynchrony.TRIALS)}")
             result = asynchrony.fly(trial, args.actors, args.hold, base, pilot.policy, place / f"flight-{number}")
             line.clear()
             print(json.dumps(asdict(result)) if args.json else result.row(), flush=True)
@@ -197,7 +178,7 @@ def _asynchrony(args: argparse.Namespace) -> int:
 
 def _chaos(args: argparse.Namespace) -> int:
     line = Line()
-    return verify_chaos.main(args, line.write, line.clear)
+    return verify_chaos.main(args, line.say, line.clear)
 
 
 MAINS: dict[str, Callable[[argparse.Namespace], int]] = {

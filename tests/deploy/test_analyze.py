@@ -91,3 +91,16 @@ def test_a_run_without_flights(run, tmp_path, capsys):
 def test_matplotlib_is_imported_only_for_pictures():
     code = "import sys, deploy.commands.analyze, deploy.commands.map; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_bound_of_0_is_not_compared_with(tmp_path, capsys):
+    """Two UAVs on a map of two cells: no cell is ever unvisited."""
+    (tmp_path / "two.txt").write_text("##\n")
+    mission = ["--actors", "2", "--ticks", "20", "--map", str(tmp_path / "two.txt")]
+    out = str(tmp_path / "R")
+    assert main(["fly", "planner:greedy", *mission, "--lockstep", "--no-pictures", "--out", out]) == 0
+    printed = capsys.readouterr().out
+    assert next(line for line in printed.splitlines() if "episode 1 " in line).split()[-1] == "-"
+    assert "lower bound" not in printed
+    assert main(["evaluate", "planner:greedy", *mission, "--seeds", "2", "--jobs", "1"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].split()[-4] == "-"

@@ -120,14 +120,3 @@ def test_no_run(view: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["log", view, str(tmp_path)]) == 2
     assert "holds no logs of a run" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_takes_long_says_how_far_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now = [0.0]
-    monkeypatch.setattr(log_check.time, "monotonic", lambda: now[0])
-    show = log_check._Progress()
-    for now[0] in (1.0, 1.9, 2.5, 3.0, 8.0):
-        show("reading tmc.mcap", now[0] / 10)
-    assert capsys.readouterr().err.splitlines() == ["reading tmc.mcap: 25%", "reading tmc.mcap: 80%"]

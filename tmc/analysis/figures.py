@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,31 +16,35 @@ from tmc.analysis.flown import Episode, Flown, Learning
 from tmc.analysis.mapfigures import map_picture, paths_picture
 from tmc.analysis.summary import Mission, Summary
 
-__all__ = ["curves_picture", "draw", "map_picture", "paths_picture", "uncertainty_picture"]
+__all__ = ["curves_picture", "map_picture", "paths_picture", "pictures", "uncertainty_picture"]
 
 POINTS = 2000
 """Points that a curve by updates is thinned to: more cannot be seen."""
 
 
-def draw(
+def pictures(
     flown: Flown, summary: Summary, episode: int | None = None, baselines: Mapping[str, float] | None = None
-) -> list[Path]:
-    """Make the pictures of a run; returns their paths.
+) -> dict[Path, Callable[[], Path]]:
+    """The pictures of a run: each one's path, and what makes it.
 
     `episode` for paths and ticks, by default the last one that is complete. `baselines`: dashed lines by name,
     uncertainty a road cell.
     """
     folder = flown.folder / "report"
     shown = flown.episode(summary.last.episode if episode is None else episode)
-    made = [
-        map_picture(flown.world.map, folder / "map.png", shown.cells[0][shown.cells[0] >= 0].tolist()),
-        paths_picture(flown.world, shown, folder / "paths.png"),
-    ]
+    starts = shown.cells[0][shown.cells[0] >= 0].tolist()
+    found: dict[str, Callable[[Path], Path]] = {
+        "map.png": lambda path: map_picture(flown.world.map, path, starts),
+        "paths.png": lambda path: paths_picture(flown.world, shown, path),
+    }
     if summary.mission.learning:
-        return [*made, curves_picture(flown, summary, folder / "curves.png", baselines or {})]
-    return [*made, uncertainty_picture(flown, summary, shown, folder / "uncertainty.png")]
+        found["curves.png"] = lambda path: curves_picture(flown, summary, path, baselines or {})
+    else:
+        found["uncertainty.png"] = lambda path: uncertainty_picture(flown, summary, shown, path)
+    return {folder / name: partial(picture, folder / name) for name, picture in found.items()}
 
 
+@style.own_settings()
 def curves_picture(flown: Flown, summary: Summary, path: Path, baselines: Mapping[str, float]) -> Path:
     """Four curves of training: three by episode, one by updates."""
     made = style.figure(11, 7.5)
@@ -52,7 +57,9 @@ def curves_picture(flown: Flown, summary: Summary, path: Path, baselines: Mappin
         axes.set_xlabel(f"episode (of {summary.mission.ticks:,} ticks)")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     m = summary.mission
-    made.suptitle(f"Training of {m.uavs} UAVs on {m.map}, scenario {m.scenario}, {_period(m)}, seed {m.seed}")
+    made.suptitle(
+        f"Training of {m.uavs} UAVs on {style.name(m.map)}, scenario {m.scenario}, {_period(m)}, seed {m.seed}"
+    )
     return style.save(made, path)
 
 
@@ -75,7 +82,7 @@ def _uncertainty_curve(axes: Any, summary: Summary, baselines: Mapping[str, floa
     if summary.lower_bound_per_cell is not None:
         axes.axhline(summary.lower_bound_per_cell, color=style.BLACK, linewidth=1.2, label="lower bound")
     for (name, value), colour in zip(baselines.items(), _repeat(style.UAV_COLOURS), strict=False):
-        axes.axhline(value, color=colour, linewidth=1.4, linestyle="--", label=name)
+        axes.axhline(value, color=colour, linewidth=1.4, linestyle="--", label=style.name(name))
     axes.set_ylim(bottom=0)
     what = "share of cells with an active event" if summary.mission.scenario == 1 else "mean uncertainty"
     axes.set(title="Uncertainty, eq. (6): lower is better", ylabel=f"{what} a road cell")
@@ -139,6 +146,7 @@ def _thin(values: NDArray[Any]) -> NDArray[Any]:
     return values[:: max(1, values.size // POINTS)]
 
 
+@style.own_settings()
 def uncertainty_picture(flown: Flown, summary: Summary, shown: Episode, path: Path) -> Path:
     """The sum over cells by tick of one episode, other episodes in grey, with its mean and the bound."""
     made = style.figure(9, 4.8)
@@ -158,6 +166,6 @@ def uncertainty_picture(flown: Flown, summary: Summary, shown: Episode, path: Pa
     axes.set_ylim(bottom=0)
     axes.set_ylabel("active events" if m.scenario == 1 else f"uncertainty, sum over {m.monitored_cells:,} cells")
     what = "Active events" if m.scenario == 1 else "Uncertainty"
-    axes.set_title(f"{what} by tick: {m.who}, {m.uavs} UAVs, scenario {m.scenario}, {_period(m)}")
+    axes.set_title(f"{what} by tick: {style.name(m.who)}, {m.uavs} UAVs, scenario {m.scenario}, {_period(m)}")
     axes.legend(loc="lower right", frameon=False, fontsize=9)
     return style.save(made, path)

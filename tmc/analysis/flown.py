@@ -68,7 +68,7 @@ class Learning:
 class Flown:
     """A run. `updates`: of the network, as far as any log says. `outcome`: run.json, empty without one.
 
-    `seconds`: wall time from the first to the last log entry.
+    `seconds`: how long its processes were at work, by a clock that is never set, without the time between them.
     `notes`: sentences on what is wrong with the logs; empty when all were closed in order.
     """
 
@@ -103,7 +103,7 @@ def read(folder: Path) -> Flown:
     episodes = gathered.episodes(world)
     if not episodes:
         raise RecordError(f"{folder} holds no flight: its mission ended before the first records came in")
-    span = (gathered.last - gathered.first) / 1e9
+    span = max(gathered.flying.total, gathered.learning.total)
     learning = _learning(gathered.learner or gathered.policies)
     return Flown(folder, world, episodes, learning, gathered.updates, span, files, _outcome(folder), tuple(notes))
 
@@ -115,6 +115,25 @@ def _outcome(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
+
+
+@dataclass
+class Elapsed:
+    """Seconds that one process after the other was at work, each counting its own from 0."""
+
+    before: float = 0.0
+    last: float = 0.0
+
+    def take(self, seconds: float) -> None:
+        """One process's seconds so far; fewer than before are those of the next process."""
+        if seconds < self.last:
+            self.before += self.last
+        self.last = seconds
+
+    @property
+    def total(self) -> float:
+        """Of all processes."""
+        return self.before + self.last
 
 
 @dataclass
@@ -130,8 +149,8 @@ class _Gathered:
     policies: dict[int, tuple[float, ...]] = field(default_factory=dict)
     known: set[tuple[int, int]] = field(default_factory=set)
     updates: int = 0
-    first: int = 2**63
-    last: int = 0
+    flying: Elapsed = field(default_factory=Elapsed)
+    learning: Elapsed = field(default_factory=Elapsed)
 
     def take(self, path: Path) -> list[str]:
         """Read one file; returns what is wrong with it."""
@@ -141,7 +160,6 @@ class _Gathered:
             return [str(error)]
         for raw in log.raw():
             handler = _HANDLERS.get(raw.schema)
-            self.first, self.last = min(self.first, raw.log_time), max(self.last, raw.log_time)
             if handler is not None:
                 handler(self, decode(raw))
         if log.damage:
@@ -157,6 +175,7 @@ class _Gathered:
 
     def _metrics(self, m: Any) -> None:
         self.updates = max(self.updates, m.updates)
+        self.flying.take(m.elapsed)
         self.metrics[m.episode].append(m)
 
     def _events(self, m: Any) -> None:
@@ -169,6 +188,7 @@ class _Gathered:
 
     def _learner(self, m: Any) -> None:
         self.updates = max(self.updates, m.updates)
+        self.learning.take(m.wall)
         self.learner[m.updates] = (m.loss, m.q_mean, m.target_mean)
 
     def _policy(self, m: Any) -> None:

@@ -26,6 +26,7 @@ NAMED = 10
 Cells = NDArray[np.int64]
 
 
+@style.own_settings()
 def map_picture(road_map: RoadMap, path: Path, starts: Iterable[int] = ()) -> Path:
     """Roads, blocked cells and, where given, start cells; returns `path`."""
     made, axes = _axes(road_map)
@@ -41,10 +42,12 @@ def map_picture(road_map: RoadMap, path: Path, starts: Iterable[int] = ()) -> Pa
         axes.scatter(*_xy(road_map, np.array(chosen)), s=70, color=style.VERMILION, edgecolor="white", zorder=3)
         handles.append(_marker("o", style.VERMILION, f"start ({len(chosen)} UAVs)"))
     _legend(made, handles)
-    axes.set_title(f"{road_map.name}: {road_map.grid.rows} x {road_map.grid.cols} cells of {road_map.cell_m:g} m")
+    size = f"{road_map.grid.rows} x {road_map.grid.cols} cells of {road_map.cell_m:g} m"
+    axes.set_title(f"{style.name(road_map.name)}: {size}")
     return style.save(made, path)
 
 
+@style.own_settings()
 def paths_picture(world: World, episode: Episode, path: Path) -> Path:
     """The paths of the last ticks over the map at the end of the episode, newest strongest."""
     made, axes = _axes(world.map)

@@ -7,17 +7,26 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tmc.analysis.summary import EpisodeFacts, Summary
+from tmc.kernel.text import printable
 
 WIDTH, LINES = 80, 24
 _LABEL = 11
 
 
-def text(s: Summary, pictures: Sequence[Path] = (), *, kept: bool = True) -> str:
-    """The report, without a newline at its end. `kept`: the summary is in the run folder too."""
-    paths = list(_paths(s, pictures, kept=kept))
+def text(s: Summary, reserve: int = 0, *, kept: bool = True) -> str:
+    """The report, without a newline at its end.
+
+    `reserve`: lines of the screen for what will be said after it. `kept`: the summary is in the run folder too.
+    """
+    paths = list(_paths(s, kept=kept))
     lines = [*_mission(s), "", *_uncertainty(s), "", *_facts(s)]
-    notes = _notes(s, LINES - len(lines) - len(paths))
-    return "\n".join([*lines, *notes, *paths])
+    notes = _notes(s, LINES - len(lines) - len(paths) - reserve)
+    return "\n".join(map(printable, [*lines, *notes, *paths]))
+
+
+def pictures(paths: Sequence[Path]) -> str:
+    """The line that says where the pictures lie, all of one folder."""
+    return printable(f"{'Pictures':<{_LABEL}}{paths[0].parent}/{{{','.join(sorted(p.name for p in paths))}}}")
 
 
 def _row(label: str, words: str) -> str:
@@ -80,7 +89,8 @@ def _facts(s: Summary) -> Iterator[str]:
     yield _row("Roads", f"{roads} in {which}")
     if last.events_appeared is not None:
         yield _row("Events", f"{_events(last)} in {which}")
-    yield _row("Pace", f"{p.ticks:,} ticks in {_clock(p.seconds)}, {p.ticks_per_second:,.0f} a second")
+    took = f" in {_clock(p.seconds)}, {p.ticks_per_second:,.0f} a second" if p.seconds else ""
+    yield _row("Pace", f"{p.ticks:,} ticks{took}")
     if s.mission.learning:
         loss = "" if p.loss is None else f"; last loss {p.loss:.3g}"
         yield _row("Learning", f"{p.updates:,} updates, {p.updates_per_second:,.0f} a second{loss}")
@@ -114,13 +124,11 @@ def _notes(s: Summary, room: int) -> list[str]:
     return lines if len(lines) <= room else [*lines[: max(room - 1, 0)], f"{indent}and more: see summary.json"]
 
 
-def _paths(s: Summary, pictures: Sequence[Path], *, kept: bool) -> Iterator[str]:
+def _paths(s: Summary, *, kept: bool) -> Iterator[str]:
     """Paths stay whole, so that they can be copied, even where they are long."""
     yield f"{'Logs':<{_LABEL}}{s.run}/*.mcap*"
     if kept:
         yield f"{'Summary':<{_LABEL}}{s.run}/summary.json"
-    if pictures:
-        yield f"{'Pictures':<{_LABEL}}{pictures[0].parent}/{{{','.join(sorted(p.name for p in pictures))}}}"
 
 
 def _count(n: int, thing: str) -> str:

@@ -78,7 +78,10 @@ class Mean:
 
 @dataclass(frozen=True)
 class Pace:
-    """`seconds`: wall time from the first to the last log entry. `ticks` of the team, `updates` of the network."""
+    """`seconds`: how long the processes were at work, by a clock that is never set.
+
+    `ticks` of the team, `updates` of the network.
+    """
 
     seconds: float
     ticks: int

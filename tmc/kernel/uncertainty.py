@@ -95,6 +95,10 @@ def arrival_probability(alpha: NDArray[np.float64]) -> NDArray[np.float64]:
     return -np.expm1(-alpha)
 
 
+ROUNDING = 1e-12
+"""A bound below this share of the rates is 0: what is left of it is rounding, and nothing can be compared with it."""
+
+
 def lower_bound(alpha: NDArray[np.float64], uavs: int, ticks: int) -> float:
     """No team of N UAVs can have a smaller eq. (6) in scenario II, from a map all visited.
 
@@ -103,7 +107,8 @@ def lower_bound(alpha: NDArray[np.float64], uavs: int, ticks: int) -> float:
     """
     rates = alpha[alpha > 0]
     relaxed = _best_spread(rates, uavs * ticks, ticks)
-    return max(relaxed, _youngest(rates, uavs, ticks)) if np.ptp(rates) == 0 else relaxed
+    bound = max(relaxed, _youngest(rates, uavs, ticks)) if np.ptp(rates) == 0 else relaxed
+    return bound if bound > ROUNDING * rates.sum() else 0.0
 
 
 def _youngest(rates: NDArray[np.float64], uavs: int, ticks: int) -> float:

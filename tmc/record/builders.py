@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.schemas import FlightRecord, foxglove, message_class
 from tmc.wire.fields import FieldError
@@ -130,6 +131,6 @@ def log_message(level: str, text: str, name: str, time_ns: int) -> Any:
     """A foxglove.Log: `name` is the process that speaks; RecordError when the level is none of LEVELS."""
     if level not in LEVELS:
         raise RecordError(f"there is no log level {level!r}: choose one of {', '.join(LEVELS)}")
-    message = message_class("foxglove.Log")(level=LEVELS[level], message=text, name=name)
+    message = message_class("foxglove.Log")(level=LEVELS[level], message=printable(text), name=printable(name))
     message.timestamp.FromNanoseconds(time_ns)
     return message

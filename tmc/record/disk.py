@@ -104,6 +104,10 @@ def put(path: Path, content: bytes, *, sync: bool) -> None:
 
 def unwritable(path: Path, error: OSError) -> str:
     """Why a log cannot be written, and the mend."""
+    if error.errno == errno.EFBIG:
+        return (
+            f"{path} is as large as a file may be here: run `ulimit -f unlimited` and resume; what was flushed is kept"
+        )
     if error.errno in FULL:
         return f"the disk that holds {path} is full: free some space and resume; what was flushed stays readable"
     return f"{path} cannot be written ({error.strerror}): make its folder exist and writable, or choose another one"

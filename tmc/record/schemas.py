@@ -29,7 +29,7 @@ TYPES: dict[str, str] = {
     "State": "uint32 episode, string map, string replay, uint64 transitions",
     "Events": "uint32 episode, uint32* ticks, uint32* cells",
     "TeamMetrics": "uint32 episode, uint32 first, uint64 steps, uint64 updates, uint64 policy, double* uncertainty, "
-    "float* reward",
+    "float* reward, double elapsed",
     "Policy": "uint64 version, uint64 updates, string sha256, double loss, bytes model",
     "LearnerMetrics": "uint64 updates, uint32 episode, uint64 steps, double loss, double q_mean, double target_mean, "
     "double td_abs, double grad_norm, double updates_per_second, double idle_share, double wall",

@@ -6,6 +6,7 @@ after `flush()`, which ends the chunk and hands it to the system: what kill -9 c
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -152,6 +153,8 @@ class LogWriter:
     def flush(self, *, fsync: bool = False) -> None:
         """End the chunk and hand it to the system; with `fsync`, also wait until the disk has it (power cuts)."""
         with self._guard():
+            if not os.fstat(self._file.fileno()).st_nlink:  # nobody will ever read it
+                raise FileNotFoundError(errno.ENOENT, "it was removed")
             self._writer.flush()
             if fsync:
                 self._sync()

@@ -15,6 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from tmc.kernel.text import printable
+
 DONE, FAILED, USAGE, FENCED, STOPPED = 0, 1, 2, 75, 143
 """Exit codes: all well; failed; a user's mistake; replaced by a newer process of the same name; ended by a signal."""
 
@@ -35,7 +37,7 @@ class FailedError(Exception):
 def tell(text: str, prefix: str = ERROR) -> None:
     """Print a line on stderr. Never raises: a stderr that is closed, full or gone must not fail the work."""
     with suppress(OSError, ValueError):
-        print(f"{prefix}{text}", file=sys.stderr, flush=True)
+        print(f"{prefix}{printable(text)}", file=sys.stderr, flush=True)
 
 
 def note(text: str) -> None:
@@ -179,7 +181,7 @@ def how_it_ended(code: int) -> str:
 def last_error(output: str) -> str:
     """The last error that a process printed, without its prefix; empty when its last line is not one of ours."""
     lines = [line for line in output.strip().splitlines() if not line.startswith(NOTE)]
-    return lines[-1].removeprefix(ERROR) if lines and lines[-1].startswith(ERROR) else ""
+    return printable(lines[-1].removeprefix(ERROR)) if lines and lines[-1].startswith(ERROR) else ""
 
 
 def adopts_orphans() -> bool:

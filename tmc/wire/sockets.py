@@ -7,15 +7,18 @@ with heartbeats can be aborted by a peer that fills its mark and leaves.
 
 from __future__ import annotations
 
+import errno
 import re
 import socket
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import zmq
 
 from tmc.wire.codec import CodecError, decode, encode
+from tmc.wire.endpoints import EndpointError, feed_endpoint, listens, parse, to_bind, to_connect
 from tmc.wire.fields import FRAME_LIMIT
 from tmc.wire.messages import Message
 
@@ -25,21 +28,16 @@ PARTS = 16
 """Most frames in a message."""
 NAME = re.compile(rb"uav-[0-9]{3,5}|learner|observer-[0-9a-z-]{1,40}")
 """Addresses that a client may call itself."""
-
-
-class EndpointError(ValueError):
-    """An endpoint that cannot be used: one sentence with the mend."""
-
-
-def feed_endpoint(sync: str) -> str:
-    """The learner's endpoint, beside that of the UAVs: the next tcp port, or the same ipc path with `.feed`."""
-    if sync.startswith("tcp://"):
-        host, _, port = sync.rpartition(":")
-        if re.fullmatch("[0-9]{1,5}", port) and 0 < int(port) < 65_535:
-            return f"{host}:{int(port) + 1}"
-    if sync.startswith("ipc://") and len(sync) > len("ipc://"):
-        return f"{sync}.feed"
-    raise EndpointError(f"'{sync}' is no endpoint: write tcp://HOST:PORT or ipc://PATH")
+FIXES = {
+    errno.EADDRNOTAVAIL: "choose an address of this machine, or * for all of them",
+    errno.ENODEV: "choose an address of this machine, or * for all of them",
+    errno.EACCES: "choose a port from 1024 on",
+}
+"""What to do where an endpoint cannot be bound, by the reason."""
+__all__ = [
+    "EndpointError", "check_free", "dealer", "feed_endpoint", "free_port", "receive", "receive_message", "router",
+    "send", "sender_name", "unlink", "waiting",
+]  # fmt: skip
 
 
 def free_port() -> int:
@@ -57,14 +55,17 @@ def free_port() -> int:
 
 def check_free(endpoint: str) -> None:
     """Raise EndpointError unless both endpoints of a TMC can be bound here and now."""
+    ends = (endpoint, feed_endpoint(endpoint))
     with zmq.Context() as context:
-        for one in (endpoint, feed_endpoint(endpoint)):
+        for one in ends:
             router(context, one).close()
+    for one in ends:
+        unlink(one)
 
 
 def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Socket[Any]:
     """A bound ROUTER. A client that comes back takes over its name; a message to nobody raises."""
-    _check_endpoint(endpoint)
+    place = to_bind(endpoint)
     sock: zmq.Socket[Any] = context.socket(zmq.ROUTER)
     sock.setsockopt(zmq.LINGER, 0)
     sock.setsockopt(zmq.RCVHWM, queue)
@@ -72,52 +73,51 @@ def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Soc
     sock.setsockopt(zmq.MAXMSGSIZE, PART_LIMIT)
     sock.setsockopt(zmq.ROUTER_HANDOVER, 1)
     sock.setsockopt(zmq.ROUTER_MANDATORY, 1)
+    sock.setsockopt(zmq.IPV6, place.ipv6)
     try:
-        sock.bind(endpoint)
+        sock.bind(str(place))
     except zmq.ZMQError as error:
         sock.close()
-        raise EndpointError(f"cannot bind {endpoint}: {error.strerror or error}; choose a free port or path") from None
+        why = (error.strerror or str(error)).partition(" (addr=")[0]
+        fix = FIXES.get(error.errno or 0, "choose a free port or path")
+        raise EndpointError(f"cannot bind {endpoint}: {why}; {fix}") from None
     return sock
 
 
-def _check_endpoint(endpoint: str) -> None:
-    """Refuse what ZeroMQ would do something surprising with: wrap a port round, or take a path from its owner."""
-    if endpoint.startswith("tcp://"):
-        port = endpoint.rpartition(":")[2]
-        if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65_535:
-            raise EndpointError(f"{endpoint} has no port from 1 to 65535: write tcp://HOST:PORT")
-    path = Path(endpoint.removeprefix("ipc://"))
-    if endpoint.startswith("ipc://") and path.exists():
-        if path.is_file():
-            raise EndpointError(f"{path} is a file that is no socket: choose another path")
-        if path.is_socket() and _alive(endpoint):
-            raise EndpointError(f"{endpoint} is in use by another process: choose another path")
-
-
-def _alive(endpoint: str) -> bool:
-    """True when somebody listens on an ipc path: ZeroMQ would take the path away from it without a word."""
-    path = endpoint.removeprefix("ipc://")
-    with socket.socket(socket.AF_UNIX) as probe:
-        return probe.connect_ex(path) == 0
+def unlink(endpoint: str) -> None:
+    """Remove the socket's file that a ROUTER left, now that it is closed: ZeroMQ does not."""
+    path = Path(parse(endpoint).path or "@")
+    with suppress(OSError):
+        if path.is_socket() and not listens(endpoint):
+            path.unlink()
 
 
 def dealer(context: zmq.Context[Any], endpoint: str, name: str) -> zmq.Socket[Any]:
     """A DEALER that calls itself `name`, connected; ZeroMQ reconnects by itself."""
+    place = to_connect(endpoint)
     sock: zmq.Socket[Any] = context.socket(zmq.DEALER)
     sock.setsockopt(zmq.LINGER, 0)
     sock.setsockopt(zmq.IDENTITY, name.encode())
     sock.setsockopt(zmq.MAXMSGSIZE, PART_LIMIT)
     sock.setsockopt(zmq.RECONNECT_IVL, 50)
     sock.setsockopt(zmq.RECONNECT_IVL_MAX, 200)
-    if endpoint.startswith("tcp://"):
+    sock.setsockopt(zmq.IPV6, place.ipv6)
+    if not place.path:
         sock.setsockopt(zmq.HEARTBEAT_IVL, 1000)
         sock.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3000)
     try:
-        sock.connect(endpoint)
+        sock.connect(str(place))
     except zmq.ZMQError as error:
         sock.close()
         raise EndpointError(f"cannot connect to {endpoint}: {error.strerror or error}") from None
     return sock
+
+
+def waiting(endpoint: str) -> str:
+    """Why no answer comes from an endpoint, for a client that waits for one."""
+    if listens(endpoint):
+        return f"{endpoint}, where something listens and does not answer as one: is it the TMC's --bind?"
+    return f"{endpoint}, where nothing listens so far"
 
 
 def send(sock: zmq.Socket[Any], message: Message, to: bytes | None = None) -> bool:

@@ -15,6 +15,7 @@ from tmc.analysis import figures
 from tmc.analysis.flown import read
 from tmc.analysis.mapfigures import values_at
 from tmc.analysis.metrics import summarize
+from tmc.analysis.pictures import PictureError, draw_map
 from tmc.kernel.roadmap import load_map, parse_raster
 from tmc.record import facts
 from tmc.record.errors import RecordError
@@ -32,7 +33,7 @@ def colours(path):
 
 def drawn(folder, tmp_path, **how):
     flown = read(folder)
-    return {p.name: p for p in figures.draw(flown, summarize(flown), **how)}
+    return {path.name: make() for path, make in figures.pictures(flown, summarize(flown), **how).items()}
 
 
 @pytest.mark.parametrize("values", [{}, SCENARIO_1, {"team.size": 12, "world.initial_map": "random"}])
@@ -81,8 +82,8 @@ def test_the_builtin_map(tmp_path):
 
 def test_a_folder_that_cannot_be_is_said_in_a_sentence(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match="cannot be written"):
-        figures.map_picture(load_map("downtown-toronto"), tmp_path / "file" / "map.png")
+    with pytest.raises(PictureError, match=r"exists|directory"):
+        draw_map(load_map("downtown-toronto"), tmp_path / "file" / "map.png")
 
 
 def test_pyplot_is_not_imported():

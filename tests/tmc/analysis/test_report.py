@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from tmc.analysis.metrics import summary
-from tmc.analysis.report import text
+from tmc.analysis.report import pictures, text
 
 SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 
@@ -22,7 +22,8 @@ def fits(report, allowed=3):
 
 
 def test_it_fits_a_screen(any_summary, tmp_path):
-    report = text(any_summary, [tmp_path / "report" / name for name in ("map.png", "paths.png", "curves.png")])
+    made = [tmp_path / "report" / name for name in ("map.png", "paths.png", "curves.png")]
+    report = "\n".join([text(any_summary, reserve=1), pictures(made)])
     assert fits(report)
     assert "{curves.png,map.png,paths.png}" in report and "..." not in report
 
@@ -35,7 +36,8 @@ def test_it_fits_with_many_notes_and_crashes(any_summary, tmp_path):
         restarts={f"uav-{i:03d}": 3 for i in range(40)},
     )
     mission = dataclasses.replace(any_summary.mission, seed=10**15, uavs=1000, episodes_planned=10**7)
-    report = text(dataclasses.replace(any_summary, health=health, mission=mission), [tmp_path / "map.png"])
+    report = text(dataclasses.replace(any_summary, health=health, mission=mission), reserve=1)
+    report = "\n".join([report, pictures([tmp_path / "map.png"])])
     assert fits(report)
     assert "and more: see summary.json" in report and "uav-000 ended with -9" in report
 

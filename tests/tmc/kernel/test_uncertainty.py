@@ -281,3 +281,11 @@ def test_sums_have_the_same_bits_however_many_ticks_are_reckoned_at_once(cells: 
     together = law.values(maps, ticks[:, None]).sum(axis=1).tolist()
     assert together == [float(law.values(row, t).sum()) for row, t in zip(maps, ticks.tolist(), strict=True)]
     assert together[3:5] == law.values(maps[3:5], ticks[3:5, None]).sum(axis=1).tolist()
+
+
+@pytest.mark.parametrize("alpha", [[0.01], [0.01] * 3, [0.3, 0.1], [1e-9, 1e-9], [10.0, 0.02, 5.0]])
+def test_a_team_that_is_on_every_cell_has_no_bound(alpha: list[float]) -> None:
+    """It is exactly 0, and not what rounding leaves of it, by which anything can be divided."""
+    rates = np.array(alpha)
+    assert lower_bound(rates, rates.size, 20) == 0.0
+    assert rates.size == 1 or lower_bound(rates, rates.size - 1, 20) > 0.0
