@@ -93,7 +93,7 @@ def check_training(config: Config) -> None:
     if idle := limits.idle(config):
         raise ConfigError(idle)
     for sentence in limits.remarks(config):
-        print(f"overfly: {sentence}", file=sys.stderr)
+        process.tell(sentence)
 
 
 def needs(config: Config, policy: bytes | None) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -29,6 +28,7 @@ from tmc.record.reader import Log, run_files
 from tmc.record.seal import seal_log
 from tmc.record.writer import LogWriter
 from tmc.roster import Outbox
+from tmc.wire import process
 
 NONE = "none"
 CASES = (NONE, "process", "power")
@@ -227,4 +227,4 @@ def records_alone(config: Config, flown: Path, folder: Path) -> Path:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    process.tell(text, prefix="")

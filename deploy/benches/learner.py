@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -32,7 +31,7 @@ from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.world import World
 from tmc.record.reader import Log, decode, run_files
 from tmc.replay import Replay
-from tmc.wire import messages
+from tmc.wire import messages, process
 from tmc.wire.messages import Minibatch
 
 if TYPE_CHECKING:
@@ -110,7 +109,7 @@ def shares(bench: str, case: str, flown: list[Learned]) -> Iterator[Row]:
 
 def say(text: str) -> None:
     """Progress."""
-    print(text, file=sys.stderr, flush=True)
+    process.tell(text, prefix="")
 
 
 def bare_loop(config: Config, seconds: float, name: str) -> float:

@@ -6,7 +6,6 @@ Memory is proportional (PSS): a page that several processes share counts once in
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import Observer
 from tmc.kernel.world import World
 from tmc.replay import Replay
+from tmc.wire import process
 
 LIMIT = 600.0
 """MB that is asked of three UAVs, the TMC, the learner and whoever starts them."""
@@ -70,7 +70,7 @@ def in_training(world: World, transitions: int, out: Path) -> rollout.Memory | N
             pace.check(flown)
             if time.monotonic() > told + 5.0:
                 told, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
-                print(f"{flown:,} of {transitions:,} transitions", file=sys.stderr, flush=True)
+                process.tell(f"{flown:,} of {transitions:,} transitions", prefix="")
     return None
 
 

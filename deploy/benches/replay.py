@@ -136,7 +136,7 @@ def fill(replay: Replay) -> tuple[int, float]:
     while len(replay) < full:
         episode += 1
         if episode % 10 == 0:
-            print(f"{len(replay):,} transitions", file=sys.stderr, flush=True)
+            process.tell(f"{len(replay):,} transitions", prefix="")
         for tick, rows, frame in _exchanges(world, episode):
             start = time.process_time()
             number = replay.add_frame(tick, frame)

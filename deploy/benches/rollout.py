@@ -10,7 +10,6 @@ import json
 import math
 import os
 import re
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -32,6 +31,7 @@ from tmc.journal import Journal
 from tmc.kernel.config import Config, build, flat
 from tmc.kernel.world import World
 from tmc.record.reader import Log, decode, run_files
+from tmc.wire import process
 
 TRANSPORTS = {"table": (True,), "beacons": (False,), "both": (True, False)}
 """Whether the UAVs share a table of tracks, for each value of `--transport`."""
@@ -128,7 +128,7 @@ def _rows(config: Config, transport: str, flown: list[Flown], fleet: list[float]
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    process.tell(text, prefix="")
 
 
 def _folder(scratch: Path) -> Path:

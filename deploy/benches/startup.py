@@ -31,7 +31,7 @@ from deploy.plan import ROOT
 from deploy.supervisor import MissionFailed
 from tmc.record import reader
 from tmc.record.errors import RecordError
-from tmc.wire import messages, sockets
+from tmc.wire import messages, process, sockets
 from tmc.wire.codec import decode
 
 LIMITS = {"run": 5.0, "actor": 0.6}
@@ -88,7 +88,7 @@ def _rows(size: int, taken: dict[str, list[float]]) -> Iterator[Row]:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    process.tell(text, prefix="")
 
 
 def command(*words: object) -> list[str]:

@@ -14,6 +14,7 @@ from deploy import extras
 from deploy.benches import cores
 from deploy.benches.row import finite, machine, text
 from deploy.supervisor import MissionFailed
+from tmc.wire import process
 from tmc.wire.process import FAILED, tell
 
 
@@ -68,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
     except subprocess.CalledProcessError as failed:  # what it had to say stands above
         code = failed.returncode
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        print(f"overfly: a process that was measured {how}", file=sys.stderr)
+        process.tell(f"a process that was measured {how}")
         return FAILED
     facts["cores_worth"] = [before, cores.worth()]
     if args.json:

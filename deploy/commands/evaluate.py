@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import os
-import sys
 import time
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ from tmc.kernel.roadmap import builtin_maps, load_map
 from tmc.kernel.text import printable
 from tmc.kernel.world import World
 from tmc.roster import Outbox
+from tmc.wire import process
 from tmc.wire.process import FAILED
 
 FIRST_SEED = 1_000_000
@@ -85,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
     try:
         rows = table(fly_all(work, args.jobs))
     except FlightError as error:
-        print(f"overfly: {error}", file=sys.stderr)
+        process.tell(str(error))
         return FAILED
     if args.json:
         for row in rows:
@@ -173,7 +173,7 @@ def _progress(flights: Iterable[Flight], total: int) -> Iterator[Flight]:
         now = time.monotonic()
         if now - said > 2 and done < total:
             left = (now - start) / done * (total - done)
-            print(f"{done}/{total} missions · {done / (now - start):.1f}/s · {left:.0f} s left", file=sys.stderr)
+            process.tell(f"{done}/{total} missions · {done / (now - start):.1f}/s · {left:.0f} s left", prefix="")
             said = now
         yield flight
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from deploy import extras, mission, plan, settings
 from deploy.commands.analyze import report
 from tmc.kernel.config import ConfigError
+from tmc.wire import process
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def resume(args: argparse.Namespace) -> int:
         )
     if mission.finished(args.resume):
         mission.require_settings(args.resume)
-        print(f"overfly: {args.resume} was flown to its end: this is its summary", file=sys.stderr)
+        process.tell(f"{args.resume} was flown to its end: this is its summary")
         return report(args.resume, as_json=args.json, pictures=not args.no_pictures)
     world, policy = mission.interrupted(args.resume)
     extras.require(*mission.needs(world.config, policy))
