@@ -31,7 +31,7 @@ CASES = [
     (("fly", "nowhere.onnx"), "no policy file and no run folder"),
     (("evaluate", "planner:greedy", "--seeds", "0"), "--seeds"),
     (("evaluate", "planner:greedy", "--actors", "1,x"), "--actors"),
-    (("tmc", "--bind", "here"), "no endpoint"),
+    (("tmc", "--bind", "here"), "not an endpoint"),
     (("log", "digest", "nowhere"), "nowhere"),
     (("log", "moves", "nowhere"), "nowhere"),
 ]

@@ -19,7 +19,7 @@ from tmc.wire import sockets
 from tmc.wire.codec import decode
 from tmc.wire.sockets import EndpointError
 
-NOWHERE = "ipc:///nowhere/sync"
+NOWHERE = "tcp://127.0.0.1:1"
 """Where no TMC ever is."""
 
 
