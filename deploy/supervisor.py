@@ -15,6 +15,7 @@ from pathlib import Path
 from deploy import plan as plans
 from deploy.forked import ForkServer, Handle, forkserver_command
 from deploy.suspension import Suspension
+from tmc.kernel.text import printable
 from tmc.wire import process
 
 BACKOFF = (0.1, 5.0)
@@ -151,14 +152,14 @@ class Supervisor:
         running.crashes = crashed + (0 if up > STEADY else running.crashes)
         how = process.how_it_ended(code)
         log = self.log_of(child.name)
-        reason = self._reason(child)
+        reason = self._reason(child, code)
         if crashed and shutil.disk_usage(self.out).free < FULL:  # then its own sentence found no room either
             mend = f"free some space, and go on with `overfly run --resume {self.out}`"
             raise MissionFailed(f"{child.name} {how}: the disk that holds {self.out} is full; {mend}")
         if not child.restart or code in FINAL or running.crashes >= TRIES:
             raise MissionFailed(f"{child.name} {how}{reason}; its output is in {log}")
         delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1]) if crashed else BACKOFF[0]
-        self._again(running, how, delay)
+        self._again(running, f"{how}{reason}", delay)
 
     def _again(self, running: _Running, how: str, delay: float) -> None:
         """Start a process again, a while later."""
@@ -166,13 +167,21 @@ class Supervisor:
         running.restarts += 1
         self.say(f"{running.child.name} {how}; it is started again (log: {self.log_of(running.child.name)})")
 
-    def _reason(self, child: plans.Child) -> str:
-        """The error that a process left as its last line, or that of the forkserver which could not start it."""
+    def _reason(self, child: plans.Child, code: int) -> str:
+        """The error that a process left as its last line, or that of the forkserver which could not start it.
+
+        A library that aborts the process, as ZeroMQ does without a free descriptor, says so in words of its own.
+        """
         for name in (child.name, f"forkserver-{child.fork_of}"):
             log = self.log_of(name)
             text = process.last_error(log.read_text("utf-8", errors="replace")) if log.exists() else ""
             if text:
                 return f": {text[:300]}"
+        log = self.log_of(child.name)
+        if code == -signal.SIGABRT and log.exists() and (said := log.read_text("utf-8", errors="replace").split("\n")):
+            return (
+                ": " + printable(next((line for line in reversed(said) if line.strip()), "no reason was given"))[:300]
+            )
         return ""
 
     def stop(self) -> None:

@@ -334,3 +334,13 @@ def test_the_reason_of_a_crash_is_repeated_and_a_note_is_not(supervise, monkeypa
 def test_a_program_that_cannot_be_started_is_one_sentence(supervise, tmp_path: Path) -> None:
     with pytest.raises(MissionFailed, match="tmc cannot be started: No such file"):
         supervise(Child("tmc", (str(tmp_path / "none"),), restart=True, leads=True))
+
+
+def test_what_a_library_said_before_it_aborted_is_told(supervise, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As ZeroMQ does in a TMC that has no descriptor left."""
+    monkeypatch.setattr(supervisors, "TRIES", 2)
+    said = "Too many open files (src/ip_resolver.cpp:1)\\x1b[31m\\n"
+    supervisor = supervise(python("tmc", f"import os; os.write(2, b'{said}'); os.abort()", leads=True))
+    with pytest.raises(MissionFailed, match=r"tmc was killed by SIGABRT: Too many open files .*\\x1b\[31m; its output"):
+        watch_until(supervisor, lambda: False)
+    assert "tmc was killed by SIGABRT: Too many open files" in supervisor.notes[0]
