@@ -6,21 +6,38 @@ import argparse
 import importlib
 import os
 import shutil
+import subprocess
 import tempfile
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-from deploy import extras, settings
-from tmc.kernel.config import SETTINGS, flat
+from deploy import extras, machine, scratch, settings
+from deploy.forked import ForkServer, forkserver_command
+from deploy.plan import environment
+from tmc.kernel.config import SETTINGS, Config, flat
 from tmc.kernel.text import printable
 from tmc.kernel.world import World
+from tmc.record.reader import Log
+from tmc.record.writer import LogWriter
+from tmc.wire import process
+
+ANSWER_S, START_S = 10, 60
+"""Time that a message, and a process, may take."""
+ROOM = 200
+"""Characters for the command line of a process."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--settings", action="store_true", help="list every setting with its default and source")
-    parser.add_argument("--preset", default="paper", help="the preset whose values are listed (default: paper)")
+    parser.add_argument(
+        "--preset",
+        default="paper",
+        help="the preset whose values are listed, or that the machine is looked at for (default: paper)",
+    )
 
 
 def main(args: argparse.Namespace) -> int:
@@ -30,9 +47,10 @@ def main(args: argparse.Namespace) -> int:
     fine = True
     for package in extras.packages():
         fine &= _package(package)
+    config = settings.config_for(args.preset, {})
     for what, look in CHECKS.items():
         try:
-            print(printable(f"  ok    {what}: {look()}"))
+            print(printable(f"  ok    {what}: {look(config)}"))
         except Exception as error:  # whatever is wrong here is what the doctor is for
             fine = False
             print(printable(f"  BAD   {what}: {error}"))
@@ -57,41 +75,95 @@ def _package(package: extras.Package) -> bool:
     return optional
 
 
-def _world() -> str:
-    world = World(settings.config_for("paper", {}))
+def _world(config: Config) -> str:
+    world = World(config)
     return f"{world.map.name}, {world.law.cells.size} road cells, {int(world.map.blocked.sum())} blocked"
 
 
-def _sockets() -> str:
+def _limits(config: Config) -> str:
+    machine.require(config, learns=True)
+    return f"enough for a training of {config.team.size} UAVs"
+
+
+def _shared_folder(config: Config) -> str:
+    with scratch.made(config) as shared:
+        size = shared.tracks.stat().st_size
+    return f"room in {shared.folder.parent} for sockets and a table of {size:,} bytes"
+
+
+def _sockets(config: Config) -> str:
     import zmq  # noqa: PLC0415  the command starts without ZeroMQ
 
     from tmc.wire import messages, sockets  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory() as folder, zmq.Context() as context:
-        endpoint = f"ipc://{folder}/s"
-        server, client = sockets.router(context, endpoint), sockets.dealer(context, endpoint, "observer-doctor")
+    with scratch.made(config) as shared, zmq.Context() as context:
+        server = sockets.router(context, shared.endpoint)
+        client = sockets.dealer(context, shared.endpoint, "observer-doctor")
         sockets.send(client, messages.StatusRequest())
-        answered = server.poll(2000)
+        answered = server.poll(ANSWER_S * 1000)
         server.close()
         client.close()
     if not answered:
-        raise RuntimeError("a message over ipc did not arrive in 2 s")
+        raise RuntimeError(f"a message over ipc did not arrive in {ANSWER_S} s")
     return f"ZeroMQ {zmq.zmq_version()} over ipc"
 
 
-def _disk() -> str:
+def _processes(config: Config) -> str:
+    """Start a UAV's process as a mission does; all that it does is to print its options."""
+    start = time.monotonic()
+    with scratch.made(config) as shared:
+        log = shared.folder / "uav.txt"
+        command = forkserver_command("actors", shared.folder, (), ROOM)
+        server = ForkServer(command, environment("actors", 1), shared.folder / "forkserver.txt")
+        try:
+            code = server.start("uav-000", ("--help",), log).wait(START_S)
+        except subprocess.TimeoutExpired:
+            raise RuntimeError(f"a UAV's process did not start in {START_S} s") from None
+        finally:
+            server.close()
+        if code != process.DONE:
+            said = "".join(path.read_text("utf-8", "replace") for path in shared.folder.glob("*.txt"))
+            raise RuntimeError(f"a UAV's process {process.how_it_ended(code)}: {process.last_error(said)}")
+    return f"a UAV's is forked in {time.monotonic() - start:.1f} s"
+
+
+def _log(config: Config) -> str:
+    """Write a log where runs are kept, read it, and leave everything as it was."""
+    runs = Path("runs")
+    there = runs.exists()
+    runs.mkdir(exist_ok=True)
+    try:
+        with tempfile.TemporaryDirectory(prefix="doctor-", dir=runs) as folder:
+            path = Path(folder) / "tmc.mcap"
+            with LogWriter(path, "tmc", config.journal, {}) as log:
+                log.log("info", "the doctor was here")
+            if not Log(path).finished:
+                raise RuntimeError(f"{path} cannot be read back")
+    finally:
+        if not there:
+            with suppress(OSError):  # a run has begun in it
+                runs.rmdir()
+    return f"written and read in {runs.absolute()}"
+
+
+def _disk(_: Config) -> str:
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     if free < 1:
         raise RuntimeError(f"{free:.1f} GiB free here: a long run logs more than that")
     return f"{free:.0f} GiB free in this folder"
 
 
-CHECKS: dict[str, Callable[[], str]] = {
-    "cores": lambda: f"{os.cpu_count()}",
+CHECKS: dict[str, Callable[[Config], str]] = {
+    "cores": lambda _: f"{os.cpu_count()}",
     "map": _world,
+    "limits": _limits,
+    "shared folder": _shared_folder,
     "sockets": _sockets,
+    "processes": _processes,
+    "logs": _log,
     "disk": _disk,
 }
+"""What a mission does on this machine, each by the functions that missions use."""
 
 
 def _settings(preset: str) -> int:
