@@ -26,7 +26,7 @@ MISSIONS: list[dict[str, object]] = [
     {"team.size": 5, "training.ticks": 20, "comms.period": 7, "comms.phase": "staggered", "reward.uncertainty": "own"},
 ]
 NO_FACTS = frozenset((
-    "life", "policy", "updates", "epsilon",  # how the flight came about
+    "life", "policy", "updates", "epsilon", "elapsed",  # how the flight came about
     "timestamp", "frame_id", "pose", "cell_size", "fields",  # how a map is drawn
 ))  # fmt: skip
 TOPICS = ("/uav/", "/tmc/sync", "/tmc/episode", "/tmc/events", "/tmc/metrics", "/tmc/last_visit")

@@ -161,7 +161,7 @@ print(done, first)
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     done, _, text = out.partition(" ")
-    assert "is full: free some space and resume" in text
+    assert "is as large as a file may be here: run `ulimit -f unlimited` and resume" in text
     assert not (tmp_path / "tmc.mcap").exists()
     log = Log(tmp_path / "tmc.mcap.active")
     ticks = [e.message.tick for e in log.entries()]
