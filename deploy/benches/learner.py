@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each stretch (default: 10)")
     parser.add_argument("--threads", type=int, default=2, metavar="N", help="of the learner and the loop (default: 2)")
     parser.add_argument(
-        "--steps", type=int, default=1000, metavar="U", help="updates whose results are compared (default: 1000)"
+        "--steps", type=int, default=300, metavar="U", help="updates whose results are compared (default: 300)"
     )
     settings.add_options(parser)
 

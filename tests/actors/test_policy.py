@@ -81,7 +81,7 @@ def test_it_chooses_what_the_network_values_most(town: RoadMap, mask: bool, view
         o = observer.observe(cell, peers, s.u)
         q = net(torch.tensor(o[None])).detach().numpy()[0]
         may = s.allowed if mask else range(9)
-        assert decider.choose(s) == max(may, key=q.tolist().__getitem__)
+        assert decider.choose(s) in [a for a in may if q[a] >= max(q[b] for b in may) - 1e-5]  # but for rounding
         chosen.add(decider.choose(s))
     assert len(chosen) > 1
 
