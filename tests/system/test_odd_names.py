@@ -142,4 +142,4 @@ def test_a_wall_clock_that_jumps_does_not_lengthen_a_flight(tmp_path: Path, monk
     pace = json.loads((tmp_path / "R" / "summary.json").read_text())["pace"]
     assert 0 < pace["seconds"] <= took
     assert pace["ticks_per_second"] >= 200 / took
-    assert 0 < json.loads((tmp_path / "R" / "run.json").read_text())["seconds"] <= took + 0.1
+    assert 0 <= json.loads((tmp_path / "R" / "run.json").read_text())["seconds"] <= took + 0.1  # in tenths
