@@ -13,12 +13,12 @@ from typing import Any, NoReturn
 import zmq
 
 from actors.airspace import Tracks, Waiting
+from actors.observation_hash import Oath, Witness
 from actors.pilot import LostRecordsError, Phase, Pilot
 from actors.planners import PREFIX, Decider, PlannerDecider
 from actors.radio import RadioTracks
 from actors.stalls import Lead, StallingTracks, stalls
 from actors.tracks import TableTracks, open_table
-from actors.witness import Oath, Witness
 from tmc.kernel.config import build
 from tmc.kernel.files import plain
 from tmc.kernel.observation import Observer

@@ -8,8 +8,8 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads must not spin where UAVs want the core
 
+from learner.batching import TrainingError
 from learner.checkpoint import CheckpointError
-from learner.intake import TrainingError
 from learner.service import ReplacedError, Service
 from tmc.kernel.config import ConfigError
 from tmc.kernel.roadmap import MapError

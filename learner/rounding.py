@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad
 from torch.nn.grad import conv2d_input, conv2d_weight
 
-from learner.intake import Batch
+from learner.batching import Batch
 from learner.qnet import QNet
 from tmc.kernel.config import Config
 

@@ -12,8 +12,8 @@ from typing import Any
 import zmq
 
 from learner import checkpoint
+from learner.batching import Intake
 from learner.checkpoint import CheckpointError, Saved
-from learner.intake import Intake
 from learner.trainer import UpdateMetrics, start
 from tmc.kernel import files
 from tmc.kernel.config import build

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from learner import dqn, qnet
 from learner.adam import Adam
+from learner.batching import Batch, TrainingError, check, laid_out
 from learner.export import to_onnx
 from learner.gradient import Gradient
-from learner.intake import Batch, TrainingError, check, laid_out
-from learner.known import Known
 from learner.qnet import QNet, Shape
+from learner.target_cache import Known
 from tmc.kernel.config import Config
 from tmc.kernel.grid import Grid
 from tmc.kernel.observation import Floats, Ints

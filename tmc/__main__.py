@@ -8,17 +8,17 @@ import time
 import uuid
 from pathlib import Path
 
-from tmc.journal import Journal, journal_in
+from tmc.center.journal import Journal, journal_in
+from tmc.center.recovery import recover
+from tmc.center.roster import Outbox
+from tmc.center.service import Service
+from tmc.center.station import Station
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.roadmap import MapError
 from tmc.kernel.world import world_of_run
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
-from tmc.recovery import recover
-from tmc.roster import Outbox
-from tmc.service import Service
-from tmc.station import Station
 from tmc.wire import capacity, process
 from tmc.wire.fields import FieldError
 from tmc.wire.options import Options

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from deploy import extras
-from tmc.analysis import pictures as drawing
-from tmc.analysis import report as reports
-from tmc.analysis.flown import Flown, read
 from tmc.analysis.metrics import summarize
+from tmc.analysis.report import pictures as drawing
+from tmc.analysis.report import text as reports
+from tmc.analysis.run_data import Flown, read
 from tmc.analysis.summary import Summary
 from tmc.kernel.config import ConfigError
 from tmc.record import disk

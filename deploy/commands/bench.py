@@ -11,9 +11,9 @@ import sys
 from dataclasses import asdict, dataclass
 
 from deploy import extras
-from deploy.benches import cores
-from deploy.benches.row import finite, machine, text
-from deploy.supervisor import MissionFailed
+from deploy.bench import cores
+from deploy.bench.row import finite, machine, text
+from deploy.run.supervisor import MissionFailed
 from tmc.wire import process
 from tmc.wire.process import FAILED, tell
 
@@ -31,18 +31,18 @@ class Bench:
 
 WITH_LEARNER = (extras.LEARNER,)
 BENCHES: tuple[Bench, ...] = (
-    Bench("rollout", "deploy.benches.rollout", "UAV steps a second of N processes against the fleet in one process"),
-    Bench("journal", "deploy.benches.journal", "what the TMC's journal takes, a commit costs, and a UAV step leaves"),
-    Bench("learner", "deploy.benches.learner", "updates a second of a running mission against the bare compute loop",
+    Bench("rollout", "deploy.bench.rollout", "UAV steps a second of N processes against the fleet in one process"),
+    Bench("journal", "deploy.bench.journal", "what the TMC's journal takes, a commit costs, and a UAV step leaves"),
+    Bench("learner", "deploy.bench.learner", "updates a second of a running mission against the bare compute loop",
           WITH_LEARNER),
-    Bench("startup", "deploy.benches.startup", "seconds to the first update, to a UAV's first word, and of imports",
+    Bench("startup", "deploy.bench.startup", "seconds to the first update, to a UAV's first word, and of imports",
           WITH_LEARNER),
-    Bench("memory", "deploy.benches.memory", "memory of all processes of a training, by role, and of the replay memory",
+    Bench("memory", "deploy.bench.memory", "memory of all processes of a training, by role, and of the replay memory",
           WITH_LEARNER),
-    Bench("train", "deploy.benches.train", "ticks a second of the whole recipe, start and memory, for some team sizes",
+    Bench("train", "deploy.bench.train", "ticks a second of the whole recipe, start and memory, for some team sizes",
           WITH_LEARNER),
-    Bench("replay", "deploy.benches.replay", "bytes a transition, milliseconds a minibatch, inserts a second"),
-    Bench("actor", "deploy.benches.actor", "a whole UAV step against the bare call of ONNX Runtime", WITH_LEARNER),
+    Bench("replay", "deploy.bench.replay", "bytes a transition, milliseconds a minibatch, inserts a second"),
+    Bench("actor", "deploy.bench.actor", "a whole UAV step against the bare call of ONNX Runtime", WITH_LEARNER),
 )  # fmt: skip
 
 

@@ -14,9 +14,10 @@ from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-from deploy import extras, machine, scratch, settings
-from deploy.forked import ForkServer, forkserver_command
-from deploy.plan import environment
+from deploy import extras, settings
+from deploy.run import machine, scratch
+from deploy.run.forked import ForkServer, forkserver_command
+from deploy.run.plan import environment
 from tmc.kernel.config import SETTINGS, Config, flat
 from tmc.kernel.text import printable
 from tmc.kernel.world import World

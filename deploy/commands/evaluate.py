@@ -12,14 +12,15 @@ from dataclasses import asdict, dataclass
 from statistics import mean, stdev
 from typing import Any
 
-from deploy import extras, lockstep, pool, settings, who
-from deploy.mission import bound_of, check
+from deploy import extras, policy_spec, settings
+from deploy.run import lockstep, pool
+from deploy.run.mission import bound_of, check
+from tmc.center.roster import Outbox
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.policy import FlightError
 from tmc.kernel.roadmap import builtin_maps, load_map
 from tmc.kernel.text import printable
 from tmc.kernel.world import World
-from tmc.roster import Outbox
 from tmc.wire import process
 from tmc.wire.process import FAILED
 
@@ -106,11 +107,11 @@ def team_sizes(listed: str | None) -> list[int | None]:
 
 def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | None]]:
     """(WHO, config, policy) of every mission, checked before the first one flies."""
-    pilots = [who.resolve(name) for name in dict.fromkeys(args.who)]
+    pilots = [policy_spec.resolve(name) for name in dict.fromkeys(args.who)]
     shared = shared_world(pilots, {*settings.chosen(args), *(["team.size"] if args.actors else [])})
     for pilot in pilots:
         for n in team_sizes(args.actors):
-            values = {**pilot.values, **shared, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+            values = {**pilot.values, **shared, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
             values |= {"team.pilot": pilot.values["team.pilot"]}
             values |= {} if n is None else {"team.size": n}
             config = build(values)
@@ -119,7 +120,7 @@ def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | No
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy
 
 
-def shared_world(pilots: list[who.Who], chosen: Collection[str] = ()) -> dict[str, Any]:
+def shared_world(pilots: list[policy_spec.Who], chosen: Collection[str] = ()) -> dict[str, Any]:
     """The world of the run folders among WHO, for everybody in the table; ConfigError when they do not agree on what
     is not `chosen` for all of them."""
     worlds = [{k: v for k, v in p.values.items() if k in WORLD or k.startswith("world.")} for p in pilots]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from deploy import extras, mission, plan, settings, who
+from deploy import extras, policy_spec, settings
 from deploy.commands.analyze import report
 from deploy.commands.run import add_mission_options
+from deploy.run import mission, plan
 from tmc.kernel.config import build
 
 
@@ -20,8 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
     extras.require()
-    pilot = who.resolve(args.who)
-    values = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args), **who.pilot_of(pilot)}
+    pilot = policy_spec.resolve(args.who)
+    values = {
+        **pilot.values,
+        "training.episodes": 1,
+        **policy_spec.FIXED,
+        **settings.chosen(args),
+        **policy_spec.pilot_of(pilot),
+    }
     world = mission.check(build(values), pilot.policy, pilot.name)
     if not args.lockstep:
         plan.check_machine(world.config, learns=False, out=args.out)

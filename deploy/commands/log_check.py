@@ -9,13 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deploy.commands.log_export import fresh
-from deploy.line import Line
-from tmc.analysis import check
+from deploy.run.line import Line
+from tmc.analysis.invariants import check
 from tmc.kernel.text import printable
 from tmc.record.errors import NoLogError, RecordError
+from tmc.record.mcap.compact import seal_run
+from tmc.record.mcap.recover import Recovery, recover
 from tmc.record.reader import logs_in
-from tmc.record.recover import Recovery, recover
-from tmc.record.seal import seal_run
 from tmc.wire.process import DONE, FAILED, USAGE, tell
 
 PATIENCE_S = 2.0

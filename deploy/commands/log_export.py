@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from deploy.line import Line
-from tmc.analysis import replayfile
+from deploy.run.line import Line
+from tmc.analysis.viewer import replay_file
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.merge import merge
@@ -50,9 +50,9 @@ def _merge(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    out = fresh(args.out) or replayfile.default_path(args.run, args.episode)
+    out = fresh(args.out) or replay_file.default_path(args.run, args.episode)
     with Line(delay=PATIENCE) as line:
-        made = replayfile.write(args.run, args.episode, out, line.say)
+        made = replay_file.write(args.run, args.episode, out, line.say)
     flown = made.flown
     for note in flown.notes:
         tell(note)

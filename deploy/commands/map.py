@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deploy import extras
-from tmc.analysis.pictures import PictureError, draw_map
+from tmc.analysis.report.pictures import PictureError, draw_map
 from tmc.kernel.rastertext import COMMENT, raster_text
 from tmc.kernel.roadmap import OBSTACLES, ROADS, MapError, RoadMap, builtin_maps, check, load_map
 from tmc.kernel.text import printable

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from deploy import extras, mission, plan, settings
+from deploy import extras, settings
 from deploy.commands.analyze import report
+from deploy.run import mission, plan
 from tmc.kernel.config import ConfigError
 from tmc.wire import process
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from deploy import extras, machine, mission, settings, who
-from deploy.progress import Progress
+from deploy import extras, policy_spec, settings
+from deploy.run import machine, mission
+from deploy.run.progress import Progress
 from tmc.__main__ import serve
 from tmc.kernel.config import Config, ConfigError, build, flat
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
-from tmc.record.seal import seal_log
+from tmc.record.mcap.compact import seal_log
 from tmc.wire.process import DONE, tell
 from tmc.wire.sockets import check_free
 
@@ -36,18 +37,18 @@ def main(args: argparse.Namespace) -> int:
     config = settings.config_for(args.preset, settings.chosen(args))
     policy, name = None, ""
     if args.fly:
-        pilot = who.resolve(args.fly)
+        pilot = policy_spec.resolve(args.fly)
         values = {
             **flat(config),
             **pilot.values,
             "training.episodes": 1,
-            **who.FIXED,
+            **policy_spec.FIXED,
             **settings.chosen(args),
-            **who.pilot_of(pilot),
+            **policy_spec.pilot_of(pilot),
         }
         config, policy, name = build(values), pilot.policy, pilot.name
     world = mission.check(config, policy, name)
-    learns = policy is None and not who.is_planner(config)
+    learns = policy is None and not policy_spec.is_planner(config)
     if not name:
         mission.check_training(config)
     machine.require(config, learns=learns, alone=True, out=args.out or Path())
@@ -66,7 +67,7 @@ def resume(args: argparse.Namespace) -> int:
         raise ConfigError("--resume goes on with the mission's own settings: give it nothing but --bind")
     world, policy = mission.interrupted(args.resume)
     path = mission.flown_policy(args.resume) if policy is not None else None
-    learns = policy is None and not who.is_planner(world.config)
+    learns = policy is None and not policy_spec.is_planner(world.config)
     machine.require(world.config, learns=learns, alone=True, out=args.resume)
     print(f"overfly: the TMC is at {args.bind} again, with the journal in {printable(args.resume)}", flush=True)
     code = serve(world.config, args.bind, args.resume, policy=path, tracks="", resume=True)

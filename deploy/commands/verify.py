@@ -12,11 +12,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from deploy import asynchrony, exactness, extras, settings, who
+from deploy import extras, policy_spec, settings
 from deploy.commands import verify_chaos
-from deploy.line import Line
-from deploy.mission import check, new_folder
-from deploy.progress import clock
+from deploy.run.line import Line
+from deploy.run.mission import check, new_folder
+from deploy.run.progress import clock
+from deploy.verify import asynchrony, exactness
 from tmc.kernel.config import Config, ConfigError
 from tmc.wire import process
 
@@ -115,8 +116,8 @@ def _configs(args: argparse.Namespace) -> tuple[list[Config], bytes | None]:
     """Every mission to fly, checked before the first one flies, and the policy that flies it."""
     if args.seeds < 1:
         raise ConfigError("--seeds must be 1 or more")
-    pilot = who.resolve(args.who)
-    base = {**pilot.values, "training.episodes": 1, **who.FIXED, **(exactness.STALLS if args.stalls else {})}
+    pilot = policy_spec.resolve(args.who)
+    base = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **(exactness.STALLS if args.stalls else {})}
     teams, scenarios, periods = (
         [int(item) for item in listed(option, text)]
         for option, text in (("--actors", args.teams), ("--scenarios", args.scenarios), ("--tu", args.periods))
@@ -158,8 +159,8 @@ def _name(config: Config) -> str:
 def _asynchrony(args: argparse.Namespace) -> int:
     if args.actors < 2 or args.hold <= 0:
         raise ConfigError("--actors must be 2 or more, and --hold more than 0: somebody has to be ahead of somebody")
-    pilot = who.resolve(args.who)
-    base = {**pilot.values, "training.episodes": 1, **who.FIXED, **settings.chosen(args)}
+    pilot = policy_spec.resolve(args.who)
+    base = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
     if not args.json:
         print(f"{args.actors} UAVs, one of them held back by {args.hold * 1000:g} ms a tick\n\n{asynchrony.HEAD}")
     line, good = Line(), True

@@ -12,14 +12,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from deploy import extras, settings, who
-from deploy.chaos import trial
-from deploy.chaos.blows import CUT, POWER, STOP, Blow, blows
-from deploy.chaos.storm import Storm
-from deploy.mission import check, needs, new_folder
-from deploy.progress import clock
+from deploy import extras, policy_spec, settings
+from deploy.run.mission import check, needs, new_folder
+from deploy.run.progress import clock
+from deploy.verify.chaos import trial
+from deploy.verify.chaos.faults import CUT, POWER, STOP, Blow, blows
+from deploy.verify.chaos.schedule import Storm
+from tmc.center.roster import LEARNER, uav_name
 from tmc.kernel.config import Config, ConfigError, build
-from tmc.roster import LEARNER, uav_name
 from tmc.wire import process
 
 ABOUT = "kill, stop and cut off the processes of a mission at random, and look whether anything was lost or doubled"
@@ -86,9 +86,9 @@ def _config(args: argparse.Namespace) -> tuple[Config, bytes | None]:
     if args.mode == "train":
         config = settings.config_for(args.preset or "quick", {**trial.TRAIN, **more, **settings.chosen(args)})
         return config, None
-    pilot = who.resolve(args.who)
-    base = settings.config_for(args.preset or "paper", {**pilot.values, **who.FIXED, **trial.FLY, **more})
-    return build({**settings.chosen(args), **who.pilot_of(pilot)}, base), pilot.policy
+    pilot = policy_spec.resolve(args.who)
+    base = settings.config_for(args.preset or "paper", {**pilot.values, **policy_spec.FIXED, **trial.FLY, **more})
+    return build({**settings.chosen(args), **policy_spec.pilot_of(pilot)}, base), pilot.policy
 
 
 def _blows(args: argparse.Namespace, config: Config) -> list[Blow]:

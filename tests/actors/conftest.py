@@ -11,12 +11,12 @@ from actors.fleet import Fleet
 from actors.pilot import Pilot
 from actors.planners import PlannerDecider
 from actors.tracks import TableTracks, TrackTable
+from tmc.center.roster import uav_name
+from tmc.center.station import Station
 from tmc.kernel.config import build
 from tmc.kernel.observation import Observer
 from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
 from tmc.kernel.world import World
-from tmc.roster import uav_name
-from tmc.station import Station
 from tmc.wire import messages as m
 
 RASTER = """\

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tmc.center.station import Station
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
-from tmc.station import Station
 from tmc.wire import codec, fields, sockets
 from tmc.wire import messages as m
 

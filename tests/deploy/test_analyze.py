@@ -39,9 +39,9 @@ def test_an_episode_may_be_chosen(run, capsys):
 
 
 def test_without_matplotlib_it_says_how_to_install_it_and_goes_on(run, capsys, monkeypatch):
-    for name in [n for n in sys.modules if n.split(".")[0] == "matplotlib" or n == "tmc.analysis.figures"]:
+    for name in [n for n in sys.modules if n.split(".")[0] == "matplotlib" or n == "tmc.analysis.report.figures"]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delattr("tmc.analysis.figures", raising=False)
+    monkeypatch.delattr("tmc.analysis.report.figures", raising=False)
     monkeypatch.setattr(sys, "meta_path", [NoMatplotlib(), *sys.meta_path])
     assert report(run, as_json=False) == 0
     printed = capsys.readouterr()

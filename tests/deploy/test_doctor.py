@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy import machine, scratch
 from deploy.commands import doctor
+from deploy.run import machine, scratch
 from tests.command import here
 
 

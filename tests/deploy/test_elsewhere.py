@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from deploy.cli import main
-from deploy.who import resolve
+from deploy.policy_spec import resolve
 from learner.trainer import Trainer
 from tests.command import LINE, here, overfly
 from tmc.kernel.config import Config, build

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from learner import bare
-from learner.intake import Batch
+from learner import reference
+from learner.batching import Batch
 from tmc.kernel.config import Config
 
 
@@ -20,7 +20,7 @@ def assert_exact_within_rounding(config: Config, batches: Iterable[Batch]) -> No
     where only the machine differs. A learner that computes something else is some hundred times outside:
     test_rounding.py asks this of learners that are wrong on purpose.
     """
-    found = bare.departures(config, batches)
+    found = reference.departures(config, batches)
     assert found.of_bound <= 1, f"{found.of_bound:g} times what rounding can do"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from learner.intake import Batch
+from learner.batching import Batch
 from learner.trainer import Trainer
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import N_ACTIONS, Grid

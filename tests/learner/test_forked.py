@@ -18,7 +18,7 @@ from learner.trainer import start
 from tmc.kernel.config import build
 from tmc.kernel.policy import view_shape
 from tmc.kernel.world import World
-from learner.intake import Batch
+from learner.batching import Batch
 
 config = build({"training.threads": 2})
 world = World(config)

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from learner import bare, dqn, qnet, rounding
+from learner import dqn, qnet, reference, rounding
 from learner import trainer as trainer_module
+from learner.batching import Batch
 from learner.gradient import Gradient
-from learner.intake import Batch
-from learner.known import Known
+from learner.target_cache import Known
 from learner.trainer import Trainer
 from tests.learner.claims import assert_exact_within_rounding, batches_with_repeats
 from tmc.kernel.config import Config, build, flat
@@ -150,12 +150,12 @@ def test_a_wrong_learner_is_told_from_rounding(
 
 def of_float32(net: qnet.QNet, target: qnet.QNet, config: Config, batch: Batch) -> torch.Tensor:
     """The gradient of eq. (9) as torch computes it, all weights in a row."""
-    t = bare.Tensors(batch)
+    t = reference.Tensors(batch)
     with torch.no_grad():
         y = dqn.target(t.reward * config.dqn.reward_scale, t.discount, target(t.o_next), t.allowed)
     net.zero_grad()
     torch.autograd.backward(dqn.loss(dqn.td_error(net(t.o), t.action, y), config.dqn.loss))
-    return bare.gradient(net).double()
+    return reference.gradient(net).double()
 
 
 def test_the_bound_holds_for_sums_in_any_order(small: Make, minibatch_of: Make) -> None:

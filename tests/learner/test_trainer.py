@@ -8,8 +8,8 @@ import onnxruntime
 import pytest
 import torch
 
-from learner import bare, dqn, qnet, rounding
-from learner.intake import TrainingError
+from learner import dqn, qnet, reference, rounding
+from learner.batching import TrainingError
 from learner.trainer import Trainer, copy_due
 from tests.learner.claims import assert_exact_within_rounding, batches_with_repeats
 from tmc.kernel.config import build, flat
@@ -60,7 +60,7 @@ def test_updates_are_plain_adam_on_the_plain_equations(preset, trainer_of, minib
         batch = minibatch_of(preset, n)
         exact, bound = rounding.gradient(preset, trainer.online, trainer.target, batch)
         trainer.update(batch)
-        found = bare.gradient(trainer.online).double()
+        found = reference.gradient(trainer.online).double()
         assert ((found - exact).abs() <= bound).all()
         adam.step(found)
     # Each step rounds the weight, and some ten numbers that are no larger than the step.
@@ -314,13 +314,13 @@ def test_weights_count_as_in_the_plain_equations(preset, trainer_of, minibatch_o
     batch = minibatch_of(config, weight=weight)
     exact, bound = rounding.gradient(config, trainer.online, trainer.target, batch)
     uneven, _ = rounding.gradient(config, trainer.online, trainer.target, replace(batch, weight=weight[::-1].copy()))
-    t, q = bare.Tensors(batch), trainer.online(torch.tensor(batch.observation)).detach()
+    t, q = reference.Tensors(batch), trainer.online(torch.tensor(batch.observation)).detach()
     y = dqn.target(
         t.reward * config.dqn.reward_scale, t.discount, trainer.target(t.o_next), t.allowed
     )  # theta- is theta
     losses = [w * dqn.loss(e[None], config.dqn.loss) for w, e in zip(weight, dqn.td_error(q, t.action, y), strict=True)]
     assert trainer.update(batch).loss == pytest.approx(float(sum(losses) / 6), rel=1e-5)
-    found = bare.gradient(trainer.online).double()
+    found = reference.gradient(trainer.online).double()
     assert ((found - exact).abs() <= bound).all()
     assert ((found - uneven).abs() > bound).any(), "the bound tells nothing apart"
 
@@ -334,7 +334,7 @@ def test_weights_of_one_count_as_none(paper, trainer_of, minibatch_of):
         losses = plain.update(batch).loss, weighted.update(replace(batch, weight=np.ones(16, "<f4"))).loss
         assert losses[0] == pytest.approx(losses[1], rel=1e-5)
         for trainer in (plain, weighted):
-            assert ((bare.gradient(trainer.online).double() - exact).abs() <= bound).all()
+            assert ((reference.gradient(trainer.online).double() - exact).abs() <= bound).all()
 
 
 def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatch_of):

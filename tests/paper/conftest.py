@@ -15,11 +15,11 @@ from actors.fleet import Fleet
 from actors.pilot import Pilot
 from actors.planners import PlannerDecider, Sight
 from actors.tracks import TableTracks, TrackTable
+from tmc.center.roster import uav_name
+from tmc.center.station import Station
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
-from tmc.roster import uav_name
-from tmc.station import Station
 from tmc.wire import messages as m
 
 TOWN = """\

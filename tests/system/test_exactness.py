@@ -9,7 +9,7 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from deploy import exactness
+from deploy.verify import exactness
 from tmc.kernel.config import Config, build
 from tmc.kernel.rastertext import BLOCKED, FREE, ROAD
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from deploy import settings
-from deploy.lockstep import LockStep
+from deploy.run.lockstep import LockStep
 from learner.trainer import start
-from tmc import recovery
-from tmc.analysis.check import check
-from tmc.journal import Journal
+from tmc.analysis.invariants.check import check
+from tmc.center import recovery
+from tmc.center.journal import Journal
+from tmc.center.station import Station
 from tmc.kernel.world import World
 from tmc.record.reader import Log
-from tmc.station import Station
 
 SMALL = {
     "training.ticks": 60,

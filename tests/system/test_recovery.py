@@ -17,11 +17,11 @@ from mcap.opcode import Opcode
 
 from deploy.cli import main
 from tests.command import LINE, PATIENCE
-from tmc.analysis.check import check
-from tmc.journal import journal_in
+from tmc.analysis.invariants.check import check
+from tmc.center.journal import journal_in
 from tmc.kernel.config import Journal
 from tmc.record.facts import digest
-from tmc.record.frames import frames
+from tmc.record.mcap.parser import frames
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 

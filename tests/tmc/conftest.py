@@ -16,14 +16,14 @@ from actors.pilot import LostRecordsError, Phase, Pilot
 from actors.planners import PlannerDecider, Sight
 from actors.radio import RadioTracks
 from actors.tracks import TableTracks, TrackTable
-from tmc.entries import Entry
+from tmc.center.entries import Entry
+from tmc.center.roster import uav_name
+from tmc.center.station import Station
 from tmc.kernel.config import build
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.observation import Floats, Ints, Observer
 from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
 from tmc.kernel.world import World
-from tmc.roster import uav_name
-from tmc.station import Station
 from tmc.wire import messages as m
 
 RASTER = """\

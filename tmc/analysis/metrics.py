@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.analysis.flown import UNKNOWN, Episode, Flown, Learning, read
+from tmc.analysis.run_data import UNKNOWN, Episode, Flown, Learning, read
 from tmc.analysis.summary import EpisodeFacts, Health, Mean, Mission, Pace, Summary
 from tmc.kernel.reward import Block
 from tmc.kernel.uncertainty import lower_bound

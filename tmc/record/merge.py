@@ -14,8 +14,8 @@ from mcap.records import Attachment, Metadata
 
 from tmc.record.disk import open_log
 from tmc.record.errors import RecordError
-from tmc.record.export import Export
-from tmc.record.frames import DamageError, Raw, contents
+from tmc.record.mcap.export import Export
+from tmc.record.mcap.parser import DamageError, Raw, contents
 from tmc.record.reader import Log
 
 NAME = "overfly/merged"

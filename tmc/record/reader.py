@@ -18,8 +18,8 @@ from mcap.records import Attachment, Metadata
 from tmc.record.channels import ACTIVE
 from tmc.record.disk import open_log
 from tmc.record.errors import NoLogError, RecordError
-from tmc.record.frames import MAGIC, RECOVERED, DamageError, Raw, contents
-from tmc.record.salvage import goes_on
+from tmc.record.mcap.parser import MAGIC, RECOVERED, DamageError, Raw, contents
+from tmc.record.mcap.salvage import goes_on
 from tmc.record.schemas import message_class
 
 _LOG_NAME = re.compile(rf"(tmc|learner|uav-\d+)\.mcap({re.escape(ACTIVE)})?")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from mcap.records import Attachment
 
-from tmc.record.frames import RECOVERED
+from tmc.record.mcap.parser import RECOVERED
+from tmc.record.mcap.recover import keep
 from tmc.record.reader import Log
-from tmc.record.recover import keep
 
 if TYPE_CHECKING:
     from tmc.record.writer import LogWriter

@@ -18,7 +18,7 @@ from typing import Any, Self
 from tmc.kernel.config import Journal
 from tmc.record import builders, channels, disk, schemas
 from tmc.record.errors import RecordError
-from tmc.record.mcapwriter import mcap_writer
+from tmc.record.mcap.writer import mcap_writer
 
 FORMAT = "1"
 """Version of the log format, in the metadata of each file."""

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.lockstep import run
-from deploy.progress import Progress
+from deploy.run.lockstep import run
+from deploy.run.progress import Progress
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from actors.airspace import Waiting
-from deploy.lockstep import LockStep
-from tmc.analysis.check import FILE, INVARIANTS, Result, check
-from tmc.journal import Journal as TmcJournal
+from deploy.run.lockstep import LockStep
+from tmc.analysis.invariants.check import FILE, INVARIANTS, Result, check
+from tmc.center.journal import Journal as TmcJournal
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block

@@ -11,11 +11,11 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.image import imread
 
-from tmc.analysis import figures
-from tmc.analysis.flown import read
-from tmc.analysis.mapfigures import values_at
 from tmc.analysis.metrics import summarize
-from tmc.analysis.pictures import PictureError, draw_map
+from tmc.analysis.report import figures
+from tmc.analysis.report.map_figures import values_at
+from tmc.analysis.report.pictures import PictureError, draw_map
+from tmc.analysis.run_data import read
 from tmc.kernel.roadmap import load_map, parse_raster
 from tmc.record import facts
 from tmc.record.errors import RecordError
@@ -87,5 +87,5 @@ def test_a_folder_that_cannot_be_is_said_in_a_sentence(tmp_path):
 
 
 def test_pyplot_is_not_imported():
-    code = "import sys, tmc.analysis.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, tmc.analysis.report.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from tmc.analysis.check import INVARIANTS
-from tmc.analysis.evidence import Gathering
-from tmc.analysis.reckoning import truth
-from tmc.analysis.setting import world_of
+from tmc.analysis.invariants.check import INVARIANTS
+from tmc.analysis.invariants.episode_log import Gathering
+from tmc.analysis.invariants.recompute import truth
+from tmc.analysis.run_config import world_of
 from tmc.kernel.world import World
 from tmc.record.reader import Entry, Log
 

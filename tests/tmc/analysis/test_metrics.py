@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from deploy import cli
-from deploy.lockstep import LockStep
+from deploy.run.lockstep import LockStep
 from tests.tmc.analysis.conftest import flown_as
-from tmc.analysis.flown import read
 from tmc.analysis.metrics import event_waits, summarize, summary
-from tmc.journal import Journal as TmcJournal
+from tmc.analysis.run_data import read
+from tmc.center.journal import Journal as TmcJournal
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.roadmap import load_map
 from tmc.kernel.uncertainty import lower_bound

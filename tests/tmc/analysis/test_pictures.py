@@ -18,9 +18,9 @@ from matplotlib.text import Text
 
 from deploy.cli import main
 from tests.command import LINE
-from tmc.analysis import figures, pictures, style
-from tmc.analysis.flown import read
 from tmc.analysis.metrics import summarize
+from tmc.analysis.report import figures, pictures, style
+from tmc.analysis.run_data import read
 from tmc.kernel.roadmap import load_map
 
 TASTE = """
@@ -145,7 +145,7 @@ def test_a_matplotlib_that_is_broken_costs_a_sentence(fly, capsys, monkeypatch) 
     capsys.readouterr()
 
     def broken(name: str) -> object:
-        if name == "tmc.analysis.figures":
+        if name == "tmc.analysis.report.figures":
             raise ImportError("numpy.core.multiarray failed to import")
         return load(name)
 
@@ -167,7 +167,7 @@ def test_a_current_folder_that_is_gone_does_not_matter(tmp_path: Path) -> None:
     code = f"""
 import os, pathlib, sys
 os.mkdir("gone"); os.chdir("gone"); os.rmdir("../gone")
-from tmc.analysis.pictures import draw_map
+from tmc.analysis.report.pictures import draw_map
 from tmc.kernel.roadmap import load_map
 draw_map(load_map("downtown-toronto"), pathlib.Path({str(tmp_path / "map.png")!r}))
 """

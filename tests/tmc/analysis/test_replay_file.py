@@ -23,21 +23,22 @@ from mcap.reader import make_reader
 from actors.airspace import Waiting
 from actors.pilot import Pilot
 from deploy import cli
-from deploy.lockstep import LockStep
+from deploy.run.lockstep import LockStep
 from tests.command import PATIENCE
 from tests.tmc.analysis.conftest import flown_as
-from tmc.analysis import palette, replayfile
-from tmc.analysis.replayfile import TICK_NS, TRAIL, place
-from tmc.journal import Journal
+from tmc.analysis import palette
+from tmc.analysis.viewer import replay_file
+from tmc.analysis.viewer.layout import FILE, topics_of
+from tmc.analysis.viewer.messages import SHAPES
+from tmc.analysis.viewer.replay_file import TICK_NS, TRAIL, place
+from tmc.center.journal import Journal
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
 from tmc.record import builders, facts
 from tmc.record.channels import REPLAY_CHANNELS
 from tmc.record.errors import RecordError
-from tmc.record.layout import FILE, topics_of
 from tmc.record.reader import Log, run_files
-from tmc.record.viewer import SHAPES
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 
@@ -103,9 +104,9 @@ def together(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 
 def replay(folder: Path, episode: int = 2) -> Path:
-    path = replayfile.default_path(folder, episode)
+    path = replay_file.default_path(folder, episode)
     if not path.exists():
-        replayfile.write(folder, episode, path)
+        replay_file.write(folder, episode, path)
     return path
 
 
@@ -385,19 +386,19 @@ def test_a_cut_log_is_replayed_as_far_as_it_goes(together: Flown, tmp_path: Path
     journal.writer.close()
     data = (long / "tmc.mcap").read_bytes()
     (long / "tmc.mcap").write_bytes(data[: len(data) // 3])
-    made = replayfile.write(long, 1, tmp_path / "cut.mcap")
+    made = replay_file.write(long, 1, tmp_path / "cut.mcap")
     found = messages(made.path)
     assert 20 < made.flown.ticks < 400 and not made.flown.whole
     assert made.flown.damage is not None and "it is cut" in made.flown.damage
     assert [t for t, _ in ticks_of(found, "/scene")] == list(range(made.flown.ticks + 1))
     assert set(found) == set(whole)
     (long / "tmc.mcap").rename(long / "tmc.mcap.active")
-    again = replayfile.write(long, 1, tmp_path / "active.mcap").flown
+    again = replay_file.write(long, 1, tmp_path / "active.mcap").flown
     assert (again.damage, again.ticks, again.whole) == (None, made.flown.ticks, False)
 
 
 def test_the_same_log_gives_the_same_file(together: Flown, tmp_path: Path) -> None:
-    first, again = (replayfile.write(together.folder, 1, tmp_path / name).path for name in ("1.mcap", "2.mcap"))
+    first, again = (replay_file.write(together.folder, 1, tmp_path / name).path for name in ("1.mcap", "2.mcap"))
     assert first.read_bytes() == again.read_bytes()
 
 
@@ -424,7 +425,7 @@ def test_a_log_that_does_not_fit_its_config_is_refused(together: Flown, tmp_path
     for key, value in (("team.size", 2), ("training.ticks", 30)):
         flown_as(together.folder, tmp_path / key, {key: value})
         with pytest.raises(RecordError, match="the log does not fit its config"):
-            replayfile.write(tmp_path / key, 1, tmp_path / "out.mcap")
+            replay_file.write(tmp_path / key, 1, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 
 
@@ -451,7 +452,7 @@ def test_a_log_that_cannot_be_true_is_refused_in_a_sentence(
                 change(entry.message)
             log.write(entry.topic, entry.message)
     with pytest.raises(RecordError, match="the log does not fit its config of 3 UAVs and 60 ticks"):
-        replayfile.write(tmp_path, 1, tmp_path / "out.mcap")
+        replay_file.write(tmp_path, 1, tmp_path / "out.mcap")
 
 
 def test_rerun_finds_every_topic_in_order(together: Flown) -> None:
@@ -469,5 +470,5 @@ def test_rerun_finds_every_topic_in_order(together: Flown) -> None:
 
 
 def test_the_colours_are_those_of_the_pictures() -> None:
-    style = pytest.importorskip("tmc.analysis.style")
+    style = pytest.importorskip("tmc.analysis.report.style")
     assert style.UAV_COLOURS == palette.UAV_COLOURS

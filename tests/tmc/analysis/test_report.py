@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from tmc.analysis.metrics import summary
-from tmc.analysis.report import pictures, text
+from tmc.analysis.report.text import pictures, text
 
 SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 

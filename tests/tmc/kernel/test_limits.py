@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.lockstep import LockStep
+from deploy.run.lockstep import LockStep
 from tmc.kernel import limits
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster

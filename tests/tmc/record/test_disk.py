@@ -17,9 +17,9 @@ import pytest
 from tmc.kernel.config import Journal
 from tmc.record import schemas
 from tmc.record.errors import RecordError
+from tmc.record.mcap.compact import seal_run
+from tmc.record.mcap.recover import recover
 from tmc.record.reader import Log, read
-from tmc.record.recover import recover
-from tmc.record.seal import seal_run
 from tmc.record.writer import LogWriter
 
 CHILD = """

@@ -14,8 +14,8 @@ import pytest
 from mcap.reader import make_reader
 
 from deploy import cli
-from deploy.lockstep import run
-from deploy.progress import Progress
+from deploy.run.lockstep import run
+from deploy.run.progress import Progress
 from tests.command import PATIENCE
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from deploy.supervisor import FINAL
+from deploy.run.supervisor import FINAL
 from learner.trainer import Trainer
 from tmc.kernel.config import ConfigError, build, flat
 from tmc.kernel.grid import Grid

@@ -1,0 +1,112 @@
+"""`overfly bench actor`: whole steps of a UAV (sense, observe, decide, move, reward, record) against the bare call of
+ONNX Runtime on one image, in one process on one thread, in turns.
+
+A pilot flies the network of the settings, with its first weights, in a team; the TMC's part is not
+timed. Times are the processor's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from statistics import median
+
+import numpy as np
+
+from actors.fleet import Fleet
+from actors.pilot import Pilot
+from actors.tracks import TableTracks, TrackTable
+from deploy import policy_spec, settings
+from deploy.bench import bounds
+from deploy.bench.row import Row
+from deploy.run.mission import check
+from tmc.center.roster import uav_name
+from tmc.center.station import Station
+from tmc.kernel.observation import Observer
+from tmc.kernel.policy import INPUT, OUTPUT
+from tmc.kernel.world import World
+from tmc.wire import messages as m
+
+AIM = 0.4
+"""The share of a whole step that the network should have at least."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the bench."""
+    parser.add_argument("--repeats", type=int, default=5, metavar="R", help="medians of so many episodes (default: 5)")
+    settings.add_options(parser)
+
+
+def measure(args: argparse.Namespace) -> list[Row]:
+    """Fly episodes, with as many bare calls after each stretch as it had steps."""
+    bounds.number("--repeats", args.repeats, 1)
+    values = {**policy_spec.FIXED, "training.episodes": args.repeats, **settings.chosen(args)}
+    world = check(settings.config_for("paper", values))
+    bounds.missions(world)
+    team = Team(world, first_policy(world))
+    flown = [team.fly(episode) for episode in range(1, args.repeats + 1)]
+    steps, calls = (median(f[i] for f in flown) for i in (0, 1))
+    share = median(call / step for step, call in flown)
+    case = f"N={world.config.team.size}"
+    return [
+        Row("actor", f"{case} a whole step", 1e6 * steps, "us", 1e6 * calls, share, "the call of ONNX Runtime / step"),
+        Row("actor", f"{case} steps", 1 / steps, "UAV steps/s", 1 / calls, share, f"x bare calls/s, aim {AIM:g}"),
+    ]
+
+
+def first_policy(world: World) -> bytes:
+    """The policy file of a learner that has not learned yet."""
+    from learner.trainer import start  # noqa: PLC0415  torch only for those who measure this
+
+    return start(world.config, world.grid).policy()[1]
+
+
+class Team:
+    """Pilots in one process, in lock step, and a TMC whose time is not theirs."""
+
+    def __init__(self, world: World, policy: bytes) -> None:
+        from actors.policy import NetworkDecider, open_model  # noqa: PLC0415  ONNX Runtime only for those who measure this
+
+        config, observer = world.config, Observer(world)
+        self.station = Station(world, "bench", policy=policy, learning=False)
+        self.decider = NetworkDecider(policy, config, observer)
+        self._session, self._image = open_model(policy)[0], np.zeros((1, *observer.shape), np.float32)
+        table = TrackTable(config.team.size, config.training.ticks)
+        team = range(config.team.size)
+        tracks = [TableTracks(table, i) for i in team]
+        pilots = [Pilot(world, i, 1, tracks[i], observer, lambda _: self.decider) for i in team]
+        self.fleet, self._elsewhere = Fleet(pilots, self._exchange), 0.0
+        for i in team:
+            for j, answer in self._exchange(i, m.Hello("uav", i, 1)):
+                self.fleet.deliver(j, answer)
+
+    def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
+        start = time.process_time()
+        self.station.handle(uav_name(uav), message, 0.0)
+        sends = self.station.out.take().sends
+        self.station.committed()
+        self._elsewhere += time.process_time() - start
+        return [(int(to.removeprefix("uav-")), answer) for to, answer in sends if to.startswith("uav-")]
+
+    def fly(self, episode: int) -> tuple[float, float]:
+        """Seconds a whole step, and seconds a bare call, in the rest of an episode."""
+        spent = bare = 0.0
+        before = flown = self._steps()
+        while self.station.flight is not None and self.station.flight.episode == episode:
+            since, elsewhere = time.process_time(), self._elsewhere
+            self.fleet.step()
+            spent += time.process_time() - since - (self._elsewhere - elsewhere)
+            steps, flown = self._steps() - flown, self._steps()
+            bare += self._calls(steps)
+        return spent / (flown - before), bare / (flown - before)
+
+    def _steps(self) -> int:
+        return sum(pilot.steps for pilot in self.fleet.pilots)
+
+    def _calls(self, count: int) -> float:
+        """Seconds of as many forward passes of one image, as anybody would call them."""
+        run, names, image = self._session.run, [OUTPUT], {INPUT: self._image}
+        start = time.process_time()
+        for _ in range(count):
+            run(names, image)
+        return time.process_time() - start

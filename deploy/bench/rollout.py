@@ -1,0 +1,247 @@
+"""`overfly bench rollout`: N UAV processes against the lock-step fleet, in turns, so that both see the same machine.
+
+A rate is taken over the flight alone, from the log: UAV steps between the first tick that became final and the last.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from deploy import policy_spec, settings
+from deploy.bench import bounds
+from deploy.bench.row import Row
+from deploy.commands.evaluate import team_sizes
+from deploy.run import lockstep, plan
+from deploy.run.mission import check
+from deploy.run.progress import Observer
+from deploy.run.supervisor import Supervisor
+from tmc.center.journal import Journal
+from tmc.kernel.config import Config, build, flat
+from tmc.kernel.world import World
+from tmc.record.reader import Log, decode, run_files
+from tmc.wire import process
+
+TRANSPORTS = {"table": (True,), "beacons": (False,), "both": (True, False)}
+"""Whether the UAVs share a table of tracks, for each value of `--transport`."""
+LIMITS = {"private": 35.0, "memory": 4096.0, "start": 15.0}
+"""What is asked of a team of 100: MiB of private memory a UAV, MiB in all, seconds until the first tick is flown."""
+MISSION = 0.5
+"""Seconds that a mission of processes takes at least."""
+POLL = 0.05
+"""Seconds between two looks at the processes."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """MiB while flying: private to a UAV's process (the largest), and of all processes, shared pages counted once; the
+    latter by role too, all UAVs together.
+    """
+
+    private: float
+    total: float
+    roles: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One mission: UAV steps a second; seconds from start to the first tick; the share of time that UAVs waited for
+    peers; beacons a UAV step."""
+
+    rate: float
+    start: float
+    waits: float | None
+    beacons: float
+    memory: Memory | None = None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the bench."""
+    parser.add_argument("--who", default="planner:greedy", help="policy file, run folder or planner (default: greedy)")
+    parser.add_argument("--actors", default="1,2,3,10,50,100", metavar="N[,N...]", help="default: %(default)s")
+    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
+    parser.add_argument("--transport", choices=TRANSPORTS, default="table", help="of positions (default: table)")
+    settings.add_options(parser, actors=False)
+
+
+def measure(args: argparse.Namespace) -> list[Row]:
+    """Fly all of it; one row a figure."""
+    pilot = policy_spec.resolve(args.who)
+    values = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
+    bounds.number("--repeats", args.repeats, 1, MISSION)
+    sizes = [n for n in team_sizes(args.actors) if n is not None]
+    worlds = [check(build({**values, "team.size": n}), pilot.policy) for n in sizes]
+    for world in worlds:
+        bounds.missions(world, 2 * args.repeats)
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:
+        for world in worlds:
+            rows += _size(world, pilot.policy, args, Path(scratch))
+    return rows
+
+
+def _size(world: World, policy: bytes | None, args: argparse.Namespace, scratch: Path) -> list[Row]:
+    """All repeats of one team size: the fleet, then the processes over each transport, and again."""
+    transports = TRANSPORTS[args.transport]
+    fleet: list[Flown] = []
+    teams: dict[bool, list[Flown]] = {table: [] for table in transports}
+    for repeat in range(args.repeats):
+        fleet.append(fly_fleet(world, policy, _folder(scratch)))
+        for table in transports:
+            teams[table].append(fly_processes(world, policy, _folder(scratch), table=table, weigh=repeat == 0))
+        last = ", ".join(f"{flown[-1].rate:,.0f}" for flown in teams.values())
+        _say(f"N = {world.config.team.size}: fleet {fleet[-1].rate:,.0f}, processes {last} UAV steps a second")
+    rates = [f.rate for f in fleet]
+    rows = [Row("rollout", f"N={world.config.team.size} one process", median(rates), "UAV steps/s")]
+    for table, flown in teams.items():
+        rows += _rows(world.config, "table" if table else "beacons", flown, rates)
+    return rows
+
+
+def _rows(config: Config, transport: str, flown: list[Flown], fleet: list[float]) -> Iterator[Row]:
+    case, memory = f"N={config.team.size} {transport}", flown[0].memory
+    rates = [f.rate for f in flown]
+    ratio = median(a / b for a, b in zip(rates, fleet, strict=True))
+    yield Row("rollout", case, median(rates), "UAV steps/s", median(fleet), ratio, "x one process")
+    waits = [f.waits for f in flown if f.waits is not None]
+    yield Row("rollout", f"{case} waits", median(waits) if waits else None, "share of time")
+    yield Row("rollout", f"{case} beacons", median(f.beacons for f in flown), "beacons/step")
+    figures: dict[str, tuple[float | None, str]] = {
+        "private": (memory.private if memory else None, "MiB, largest UAV"),
+        "memory": (memory.total if memory else None, "MiB in all"),
+        "start": (median(f.start for f in flown), "s to the first tick"),
+    }
+    for name, (value, unit) in figures.items():
+        limit = LIMITS[name]
+        yield Row("rollout", f"{case} {name}", value, unit, limit, value and value / limit, "of the limit")
+
+
+def _say(text: str) -> None:
+    process.tell(text, prefix="")
+
+
+def _folder(scratch: Path) -> Path:
+    return Path(tempfile.mkdtemp(dir=scratch))
+
+
+def fly_fleet(world: World, policy: bytes | None, out: Path) -> Flown:
+    """The reference: the same mission in this process, with the same journal."""
+    start = time.time_ns()
+    journal = Journal(out, world, "bench")
+    try:
+        lockstep.LockStep(world, policy, journal.take).run()
+    finally:
+        journal.writer.close()
+    return _read(out, world.config, start)
+
+
+def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool, weigh: bool) -> Flown:
+    """The mission in processes of its own; `weigh`: look at their memory once, half way."""
+    config, memory, start = world.config, None, time.time_ns()
+    half = config.training.episodes * config.training.ticks // 2
+    with started(config, policy, out, table=table) as (supervisor, observer):
+        while not supervisor.watch():
+            time.sleep(POLL)
+            status = observer.ask()
+            if weigh and memory is None and status is not None and status.ticks > half:
+                memory = weigh_all(supervisor.pids())
+        supervisor.wait(15.0)
+    return _read(out, config, start, memory)
+
+
+@contextmanager
+def started(
+    config: Config, policy: bytes | None, out: Path, *, table: bool = True
+) -> Iterator[tuple[Supervisor, Observer]]:
+    """The processes of a mission in `out`, and who asks how far they are; they are stopped with the block."""
+    (out / "config.json").write_text(json.dumps(flat(config)), "utf-8")
+    file = None if policy is None else out / "flown.onnx"
+    if file is not None and policy is not None:
+        file.write_bytes(policy)
+    mission = plan.make(config, out, policy=file, table=table)
+    supervisor = Supervisor(mission, out, config.training.threads, _say)
+    observer = Observer(mission.endpoint)
+    try:
+        supervisor.start()
+        yield supervisor, observer
+    finally:
+        observer.close()
+        supervisor.stop()
+        supervisor.close()
+
+
+def weigh_all(pids: Mapping[str, int]) -> Memory | None:
+    """The memory of these processes and of this one; None where the system does not tell, or they are gone."""
+    try:
+        rolls = {name: _rollup(pid) for name, pid in {**pids, "supervisor": os.getpid()}.items()}
+    except OSError:
+        return None
+    uavs = [roll for name, roll in rolls.items() if name.startswith("uav-")]
+    if not uavs:
+        return None
+    private = max(roll["Private_Clean"] + roll["Private_Dirty"] for roll in uavs)
+    roles: defaultdict[str, float] = defaultdict(float)
+    for name, roll in rolls.items():
+        roles["uavs" if name.startswith("uav-") else name] += roll["Pss"] / 1024
+    return Memory(private / 1024, sum(roles.values()), dict(roles))
+
+
+def own() -> float | None:
+    """MiB of this process, shared pages in proportion; None where the system does not tell."""
+    try:
+        return _rollup(os.getpid())["Pss"] / 1024
+    except OSError:
+        return None
+
+
+def _rollup(pid: int) -> dict[str, int]:
+    """KiB by kind, from /proc/PID/smaps_rollup."""
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text("utf-8", "replace")
+    return {name: int(size) for name, size in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
+
+
+def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -> Flown:
+    """What the log of a mission says; `start` in ns of the wall clock."""
+    files = run_files(out)
+    times, beacons = [], 0
+    for raw in Log(files["tmc"]).raw():
+        if raw.topic == "/tmc/metrics":
+            times.append((raw.log_time, decode(raw).elapsed))
+        elif raw.topic == "/log":
+            said = re.search(r"\bBeacon ([0-9]+)", decode(raw).message)
+            beacons += int(said[1]) if said else 0
+    steps = config.team.size * config.training.ticks * config.training.episodes
+    seconds = times[-1][1] - times[0][1]
+    uavs = [path for name, path in files.items() if name.startswith("uav-")]
+    return Flown(
+        steps / seconds if seconds else math.nan,
+        (times[0][0] - start) / 1e9,
+        _waits(uavs, times[0][0]),
+        beacons / steps,
+        memory,
+    )
+
+
+def _waits(files: list[Path], begin: int) -> float | None:
+    """Mean over the UAVs of the time waited for peers, as a share of the flight so far, by each one's last status."""
+    shares = []
+    for file in files:
+        last: Any = None
+        for raw in Log(file).raw():
+            if raw.schema == "overfly.UavStatus":
+                last = raw
+        if last is not None and last.log_time - begin > 2e8:  # a status in the first instants says nothing
+            shares.append(decode(last).waited / ((last.log_time - begin) / 1e9))
+    return sum(shares) / len(shares) if shares else None

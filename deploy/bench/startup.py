@@ -1,0 +1,167 @@
+"""`overfly bench startup`: how long a user waits: for the first update of `overfly run quick`, for the first word of
+a UAV started by hand, for `--help`, and for what each role imports before it does anything.
+
+All are processes of their own, started as a user starts them. One start of each goes before and does not count, so the
+files that Python reads are in the system's memory: what is measured is a start, not the disk.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import zmq
+
+from deploy import settings
+from deploy.bench import bounds
+from deploy.bench.row import Row
+from deploy.run.mission import check
+from deploy.run.plan import ROOT
+from deploy.run.supervisor import MissionFailed
+from tmc.record import reader
+from tmc.record.errors import RecordError
+from tmc.wire import messages, process, sockets
+from tmc.wire.codec import decode
+
+LIMITS = {"run": 5.0, "actor": 0.6}
+"""What is asked of a start with warm caches: seconds to the first update of three UAVs, and to a UAV's first word."""
+ROLES = ("tmc", "actors", "learner")
+"""The modules of the roles: `python -m ROLE` imports `ROLE.__main__` and what it needs."""
+TURN = 2.0
+"""Seconds that all starts of a turn take at least."""
+PATIENCE = 120.0
+"""Seconds after which a start has failed."""
+POLL = 0.05
+"""Seconds between two looks at the learner's log."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the bench."""
+    parser.add_argument("--repeats", type=int, default=5, metavar="R", help="medians of so many (default: 5)")
+    parser.add_argument("--warm", type=int, default=1, metavar="W", help="turns before that do not count (default: 1)")
+    settings.add_options(parser)
+
+
+def measure(args: argparse.Namespace) -> list[Row]:
+    """Every start in turns; one row a figure."""
+    bounds.number("--repeats", args.repeats, 1, TURN)
+    bounds.number("--warm", args.warm, 0, TURN)
+    changes = [word for key, value in settings.chosen(args).items() for word in ("--set", f"{key}={value}")]
+    size = check(settings.config_for("quick", settings.chosen(args))).config.team.size
+    starts: dict[str, Callable[[Path], float]] = {
+        "run": lambda out: first_update(out, changes),
+        "actor": first_word,
+        "python": lambda _: finished("-c", "pass"),
+        "help": lambda _: finished("-m", "deploy.cli", "--help"),
+        **{role: partial(imported, role) for role in ROLES},
+    }
+    taken: dict[str, list[float]] = {name: [] for name in starts}
+    with tempfile.TemporaryDirectory(prefix="overfly-") as scratch:
+        for repeat in range(1 - args.warm, args.repeats + 1):
+            for name, start in starts.items():
+                seconds = start(Path(tempfile.mkdtemp(dir=scratch)))
+                taken[name] += [seconds] if repeat > 0 else []
+            _say(f"turn {repeat} of {args.repeats}" if repeat > 0 else "a turn that warms the caches")
+    return list(_rows(size, taken))
+
+
+def _rows(size: int, taken: dict[str, list[float]]) -> Iterator[Row]:
+    middle = {name: median(seconds) for name, seconds in taken.items()}
+    for name, case in (("run", f"run quick, N={size}"), ("actor", "actor alone")):
+        limit, unit = LIMITS[name], "s to the first update" if name == "run" else "s to its first word"
+        yield Row("startup", case, middle[name], unit, limit, middle[name] / limit, "of what is asked")
+    for name in ("help", *ROLES):
+        ratio = median(a / b for a, b in zip(taken[name], taken["python"], strict=True))
+        case, unit = ("--help", "s") if name == "help" else (f"import {name}", "s, the process as a whole")
+        yield Row("startup", case, middle[name], unit, middle["python"], ratio, "x an empty Python")
+
+
+def _say(text: str) -> None:
+    process.tell(text, prefix="")
+
+
+def command(*words: object) -> list[str]:
+    """The command line of Python with our packages, whatever lies in the folder that it is started in."""
+    return [sys.executable, "-P", *map(str, words)]
+
+
+def environment() -> dict[str, str]:
+    """This process's, with the place of our packages."""
+    path = os.pathsep.join(p for p in (str(ROOT), os.environ.get("PYTHONPATH", "")) if p)
+    return os.environ | {"PYTHONPATH": path}
+
+
+def imported(role: str, _: Path) -> float:
+    """Seconds of a process that imports what a role needs, and ends."""
+    return finished("-c", f"import {role}.__main__")
+
+
+def finished(*words: str) -> float:
+    """Seconds from the start of a process to its end."""
+    start = time.monotonic()
+    subprocess.run(command(*words), env=environment(), stdout=subprocess.DEVNULL, check=True, timeout=PATIENCE)
+    return time.monotonic() - start
+
+
+@contextmanager
+def running(*words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """`overfly WORDS`, ended in order with the block."""
+    line = command("-m", "deploy.cli", *words)
+    with subprocess.Popen(line, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as started:
+        try:
+            yield started
+        finally:
+            started.send_signal(signal.SIGINT)
+            started.communicate()
+
+
+def first_update(out: Path, changes: list[str]) -> float:
+    """Seconds from the start of `overfly run quick` to its first update, whose time is in the learner's log."""
+    start = time.monotonic()
+    with running("run", "quick", *changes, "--out", out) as run:
+        while (at := _first_update(out / "learner.mcap.active")) is None:
+            if run.poll() is not None or time.monotonic() - start > PATIENCE:
+                raise MissionFailed(f"overfly run quick made no update in {PATIENCE:g} s")
+            time.sleep(POLL)
+        return time.monotonic() - (time.time_ns() - at) / 1e9 - start  # of the wall clock only the last moments count
+
+
+def _first_update(log: Path) -> int | None:
+    """When the learner wrote its first metrics, in ns of the wall clock: it does so after its first update."""
+    try:
+        first = next((raw for raw in reader.Log(log).raw() if raw.topic == "/learner/metrics"), None)
+    except RecordError:  # not there yet, or still empty
+        return None
+    if first is None:
+        return None
+    assert reader.decode(first).updates == 1
+    return first.log_time
+
+
+def first_word(out: Path) -> float:
+    """Seconds from the start of `overfly actor` to its Hello at a TMC, which is this process here."""
+    endpoint = f"tcp://127.0.0.1:{sockets.free_port()}"  # the name of a folder may be too long for a socket
+    context: zmq.Context[Any] = zmq.Context()
+    try:
+        tmc = sockets.router(context, endpoint)
+        start = time.monotonic()
+        with running("actor", "--id", 0, "--connect", endpoint, "--out", out / "U"):
+            if not tmc.poll(int(PATIENCE * 1000)):
+                raise MissionFailed(f"a UAV said nothing for {PATIENCE:g} s")
+            seconds = time.monotonic() - start
+            frames = sockets.receive(tmc) or []
+    finally:
+        context.destroy(linger=0)
+    assert isinstance(decode(frames[1:]), messages.Hello)
+    return seconds

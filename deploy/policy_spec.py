@@ -1,0 +1,121 @@
+"""WHO flies: a policy file, a run folder, or a planner."""
+
+from __future__ import annotations
+
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from actors.planners import PLANNERS, PREFIX
+from tmc.analysis.run_config import settings_of
+from tmc.center.journal import journal_in
+from tmc.kernel import files
+from tmc.kernel.config import Config, ConfigError, flat
+from tmc.kernel.files import plain
+from tmc.kernel.observation import Observer
+from tmc.kernel.policy import PolicyCard, PolicyError
+from tmc.kernel.roadmap import COPY, builtin_maps
+from tmc.kernel.world import World
+from tmc.wire import process
+from tmc.wire.capacity import check_policy
+
+
+@dataclass(frozen=True)
+class Who:
+    """A pilot by name, with the policy file's bytes unless it is a planner, and the settings that it brings along."""
+
+    name: str
+    policy: bytes | None
+    values: dict[str, Any]
+
+
+def resolve(name: str) -> Who:
+    """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy."""
+    if name.startswith(PREFIX):
+        if name.removeprefix(PREFIX) not in PLANNERS:
+            raise ConfigError(f"there is no planner '{name}': choose {', '.join(PREFIX + p for p in PLANNERS)}")
+        return Who(name, None, {"team.pilot": name})
+    try:
+        is_folder = stat.S_ISDIR(Path(name).stat().st_mode)
+    except (OSError, ValueError):  # nothing of that name, or a name that nothing can have
+        known = ", ".join(PREFIX + p for p in PLANNERS)
+        text = f"'{plain(name)}' is no policy file and no run folder: write one of these, or {known}"
+        raise ConfigError(text) from None
+    if is_folder:
+        return _of_run(Path(name))
+    return _of_file(name, Path(name), {})
+
+
+def _of_run(folder: Path) -> Who:
+    """The final policy of a run, in the mission that it was trained for."""
+    journal, policy = journal_in(folder), folder / "policies" / "final.onnx"
+    if journal is None and not (folder / "config.json").exists():
+        raise ConfigError(f"{folder} is no run folder: it has no config.json")
+    settings = settings_of(folder, journal)
+    for note in settings.notes:
+        process.tell(f"{folder}: {note}")
+    values = dict(flat(settings.config)) | _map_of(folder, settings.config)
+    if values["team.pilot"] != "policy":
+        return Who(str(folder), None, values)
+    if not policy.exists():
+        policy = folder / "policies" / "flown.onnx"
+    if not policy.exists():
+        raise ConfigError(f"{folder} has no final policy: its training did not end")
+    return _of_file(str(folder), policy, values)
+
+
+def _map_of(folder: Path, config: Config) -> dict[str, Any]:
+    """The map of a run that flew over a user's map: the copy in its folder, where there is one."""
+    copy = folder / COPY
+    return {"world.map": str(copy)} if config.world.map not in builtin_maps() and copy.exists() else {}
+
+
+def _of_file(name: str, path: Path, values: dict[str, Any]) -> Who:
+    from actors.policy import read_card  # noqa: PLC0415  ONNX Runtime only where a policy flies
+
+    try:
+        check_policy(path.stat().st_size)
+        model = files.read_bytes(path)
+        card = read_card(model)
+    except PolicyError as error:
+        raise PolicyError(f"{plain(path)}: {error}") from None
+    except OSError as error:
+        mend = "give a policy file, a run folder or a planner"
+        raise PolicyError(f"{plain(path)} cannot be read ({error.strerror}): {mend}") from None
+    return Who(name, model, values | view_of(card) | {"team.pilot": "policy"})
+
+
+def view_of(card: PolicyCard) -> dict[str, Any]:
+    """The settings that a policy needs to see what it was trained on."""
+    return {
+        "observation.view": card.view,
+        "observation.radius": card.radius,
+        "observation.near": card.near,
+        "exploration.mask_blocked": card.mask_blocked,
+    }
+
+
+def pilot_of(who: Who) -> dict[str, Any]:
+    """The one setting that WHO decides, whatever else is set."""
+    return {"team.pilot": who.values["team.pilot"]}
+
+
+FIXED = {"exploration.start": 0.0, "exploration.end": 0.0}
+"""A fixed policy flies as it is, without exploration."""
+
+
+def require_policy(model: bytes, world: World, name: str) -> None:
+    """Raise PolicyError, which names the policy, unless it can fly in this world, as far as can be seen before."""
+    from actors.policy import NetworkDecider  # noqa: PLC0415  as above
+
+    try:
+        check_policy(len(model))
+        NetworkDecider(model, world.config, Observer(world))
+    except PolicyError as error:
+        raise PolicyError(f"{plain(name)}: {error}") from None
+
+
+def is_planner(config: Config) -> bool:
+    """True when a planner flies, and no policy."""
+    return config.team.pilot.startswith(PREFIX)

@@ -1,0 +1,193 @@
+"""The same mission in one process: the station, the pilots and, where there is one, the trainer take turns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from actors.fleet import Fleet
+from actors.observation_hash import Witness
+from actors.pilot import Pilot
+from actors.planners import PREFIX, Decider, PlannerDecider
+from actors.tracks import TableTracks, TrackTable
+from deploy.run.progress import Progress
+from tmc.center.journal import Journal
+from tmc.center.roster import LEARNER, Outbox, uav_name
+from tmc.center.station import Station
+from tmc.center.status import status
+from tmc.kernel.config import ConfigError
+from tmc.kernel.observation import Observer
+from tmc.kernel.world import World
+from tmc.record.channels import uav_topic
+from tmc.record.writer import LogWriter
+from tmc.wire import messages as m
+
+if TYPE_CHECKING:
+    from learner.trainer import Trainer
+
+
+RUN = "lockstep"
+"""What its log calls the run of a mission in one process."""
+Testify = Callable[[int, Any], None]
+"""Takes UAV i's overfly.Witness to the moves of a record."""
+
+
+class LockStep:
+    """A mission without sockets. `keep` gets every outbox of the station before its messages are delivered.
+
+    `testify`: who wants to know what the UAVs decide by; None outside of trials.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        policy: bytes | None,
+        keep: Callable[[Outbox], None],
+        trainer: Trainer | None = None,
+        testify: Testify | None = None,
+    ) -> None:
+        config = world.config
+        self.world, self.keep, self.trainer, self.testify = world, keep, trainer, testify
+        self.station = Station(world, RUN, learning=trainer is not None, policy=policy)
+        observer = self.station.observer
+        table = TrackTable(config.team.size, config.training.ticks)
+        planner = PlannerDecider(world, config.team.pilot) if config.team.pilot.startswith(PREFIX) else None
+        decider = _decider_maker(world, observer)
+        self._witnesses = [Witness(observer) for _ in range(config.team.size)]
+
+        def pilot(i: int) -> Pilot:
+            tracks, watch = TableTracks(table, i), self._witnesses[i].watch
+            if testify is None:
+                return Pilot(world, i, 1, tracks, observer, decider, planner)
+            watched = watch(planner) if planner else None
+            return Pilot(world, i, 1, tracks, observer, lambda model: watch(decider(model)), watched)
+
+        pilots = [pilot(i) for i in range(config.team.size)]
+        self.fleet = Fleet(pilots, self._exchange)
+        self._minibatches: list[m.Minibatch] = []
+        self._loss, self.final = 0.0, b""
+        """Of the last update, and the policy file that was learned, once all has been."""
+        if trainer is not None:
+            from learner.batching import Intake  # noqa: PLC0415  torch only where something is learned
+
+            self._intake = Intake(observer)
+
+    def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
+        if self.testify is not None and isinstance(message, m.Record):
+            self.testify(uav, self._witnesses[uav].testify(message))
+        self.station.handle(uav_name(uav), message, 0.0)
+        return self._take()
+
+    def _take(self) -> list[tuple[int, m.Message]]:
+        outbox = self.station.out.take()
+        self.keep(outbox)
+        self.station.committed()  # in one process nothing is lost that another one needs
+        self._minibatches += [x for to, x in outbox.sends if to == LEARNER and isinstance(x, m.Minibatch)]
+        return [(int(to.removeprefix("uav-")), x) for to, x in outbox.sends if to.startswith("uav-")]
+
+    def _tell(self, message: m.Message) -> None:
+        """The learner says something; what the station has for the UAVs is delivered."""
+        self.station.handle(LEARNER, message, 0.0)
+        for uav, reply in self._take():
+            self.fleet.deliver(uav, reply)
+
+    def run(self, show: Callable[[m.Status], None] | None = None) -> None:
+        """Fly all episodes."""
+        if self.trainer is not None:
+            self._tell(m.Hello("learner", -1, 1))
+            self._push()
+            self._tell(m.SampleRequest(0))
+        for pilot in self.fleet.pilots:
+            for uav, reply in self._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
+                self.fleet.deliver(uav, reply)
+        while self.fleet.step() | self._learn():
+            if show is not None:
+                show(status(self.station))
+        if self.trainer is not None:
+            self.final = self._push(self._loss)  # what a learner's process says last
+
+    def _learn(self) -> bool:
+        """Train on every minibatch that the limiter lets through; True when there was one."""
+        trainer, learned = self.trainer, False
+        while trainer is not None and self._minibatches:
+            metrics = trainer.update(self._intake.read(self._minibatches.pop(0)))
+            learned, self._loss = True, metrics.loss
+            if metrics.updates % self.world.config.training.push_every == 0:
+                self._push(metrics.loss)
+            self._tell(m.SampleRequest(metrics.updates, *trainer.judged()))
+        return learned
+
+    def _push(self, loss: float = 0.0) -> bytes:
+        assert self.trainer is not None
+        version, model = self.trainer.policy()
+        self._tell(m.PolicyPush(version, self.trainer.updates, loss, model))
+        return model
+
+
+def _decider_maker(world: World, observer: Observer) -> Callable[[bytes], Decider]:
+    """UAVs in one process share the session of a policy file; it holds no state of theirs."""
+    made: dict[bytes, Decider] = {}
+
+    def make(model: bytes) -> Decider:
+        from actors.policy import NetworkDecider  # noqa: PLC0415  planners fly without ONNX Runtime
+
+        if model not in made:
+            made.clear()
+            made[model] = NetworkDecider(model, world.config, observer)
+        return made[model]
+
+    return make
+
+
+def run(world: World, out: Path, policy: Path | None, progress: Progress) -> None:
+    """Fly a mission in this process, with the same log as the TMC process writes."""
+    config = world.config
+    trainer = None
+    if policy is None and config.team.pilot == "policy":
+        from learner.trainer import start  # noqa: PLC0415  torch only where something is learned
+
+        trainer = start(config, world.grid)
+    journal = Journal(out, world, RUN)
+    try:
+        with _testimonies(world, out) as testify:
+            mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, testify)
+            _run(mission, progress.show)
+        if trainer is not None:
+            from learner.service import write_policy  # noqa: PLC0415
+
+            write_policy(out / "policies" / "final.onnx", mission.final)
+    finally:
+        journal.writer.close()
+
+
+def _run(mission: LockStep, show: Callable[[m.Status], None]) -> None:
+    """Fly and learn; ConfigError where the training diverges."""
+    if mission.trainer is None:
+        mission.run(show)
+        return
+    from learner.batching import TrainingError  # noqa: PLC0415  torch only where something is learned
+
+    try:
+        mission.run(show)
+    except TrainingError as error:
+        raise ConfigError(str(error)) from None
+
+
+@contextmanager
+def _testimonies(world: World, out: Path) -> Iterator[Testify | None]:
+    """Where witnesses testify: in the logs that the UAVs would write; nowhere outside of trials."""
+    config = world.config
+    if not config.trial.witness:
+        yield None
+        return
+    with ExitStack() as stack:
+        names = [uav_name(i) for i in range(config.team.size)]
+        facts = {"run": RUN}
+        logs = [stack.enter_context(LogWriter(out / f"{n}.mcap", n, config.journal, facts)) for n in names]
+
+        def testify(uav: int, message: Any) -> None:
+            logs[uav].write(uav_topic(uav, "witness"), message)
+
+        yield testify

@@ -1,0 +1,111 @@
+"""Holds what UAVs have sworn was acknowledged against the journal: nothing is lost, and nothing is there twice."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tmc.center.journal import journal_in
+from tmc.record.builders import record_digest, to_record
+from tmc.record.channels import ACTIVE
+from tmc.record.reader import Log
+
+Number = tuple[int, int]
+"""A record: UAV and sequence."""
+
+
+@dataclass(frozen=True)
+class Exactness:
+    """What became of the records of a mission, as counts, and what was flown by its journal.
+
+    `lost`: acknowledged, and not in the journal with the digest that was sworn; `doubled`: there more than once.
+    """
+
+    acknowledged: int
+    journalled: int
+    lost: int
+    doubled: int
+    episodes: int
+    ticks: int
+    updates: int
+
+
+def judge(out: Path, known: Collection[Number] = ()) -> Exactness:
+    """The whole journal of a run against all that was sworn in it; `known`: records that are known to be lost."""
+    digests: dict[Number, str] = {}
+    times: Counter[Number] = Counter()
+    flown = Counter[str]()
+    for entry in Log(_journal(out)).entries():
+        kind, message = entry.message.DESCRIPTOR.name, entry.message
+        if kind == "FlightRecord":
+            number = message.uav, message.sequence
+            digests.setdefault(number, record_digest(to_record(message)))
+            times[number] += 1
+        elif kind == "TeamMetrics":
+            flown["ticks"] += len(message.uncertainty) - (message.first == 0)
+            flown["updates"] = message.updates
+        elif kind == "Episode":
+            flown["episodes"] += message.phase == "end"
+    oaths = set(_oaths(out))
+    lost = {number for number, digest in oaths if digests.get(number) != digest} | {*known}
+    doubled = sum(count > 1 for count in times.values())
+    sworn = {number for number, _ in oaths}
+    return Exactness(
+        len(sworn), len(times), len(lost), doubled, flown["episodes"], flown["ticks"], flown["updates"]
+    )  # fmt: skip
+
+
+def _journal(out: Path) -> Path:
+    found = journal_in(out)
+    assert found is not None, f"{out} holds no journal"
+    return found
+
+
+def oath_files(out: Path) -> list[Path]:
+    """Where UAVs have sworn."""
+    return sorted((out / "oaths").glob("uav-*.txt"))
+
+
+def _oaths(out: Path) -> Iterable[tuple[Number, str]]:
+    """((uav, sequence), digest) of each line."""
+    for path in oath_files(out):
+        uav = int(path.stem.removeprefix("uav-"))
+        for line in path.read_text("utf-8").splitlines():
+            sequence, digest = line.split()
+            yield (uav, int(sequence)), digest
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The journal as a kill of the TMC left it, and the last record that each UAV had sworn to by then.
+
+    A record that is lost with a kill may be flown again, the very same: only here it can be seen that it was lost.
+    """
+
+    journal: Path
+    sworn: dict[int, int]
+
+    @classmethod
+    def take(cls, out: Path) -> Snapshot:
+        """Keep the journal under another name: the next TMC writes a new file."""
+        link = out / "oaths" / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
+        os.link(_journal(out), link)
+        sworn = {}
+        for path in oath_files(out):
+            lines = path.read_text("utf-8").splitlines()
+            if lines:
+                sworn[int(path.stem.removeprefix("uav-"))] = int(lines[-1].split()[0])
+        return cls(link, sworn)
+
+    def lost(self) -> set[Number]:
+        """Records that were acknowledged and did not survive; the file is dropped."""
+        counts: Counter[int] = Counter()
+        for raw in Log(self.journal).raw():
+            if raw.schema == "overfly.FlightRecord":
+                counts[int(raw.topic.split("/")[2])] += 1  # a UAV's records are numbered from 0, without gap
+        self.journal.unlink()
+        return {(uav, n) for uav, last in self.sworn.items() for n in range(counts[uav], last + 1)}

@@ -1,0 +1,107 @@
+"""The same mission twice, as processes and in lock step, and every fact of the two compared."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deploy.run.mission import Mission, bound_of, check, command_line
+from deploy.run.progress import Progress
+from tmc.kernel.config import Config, build
+from tmc.kernel.world import World
+from tmc.record import compare
+from tmc.wire import messages as m
+from tmc.wire import process
+
+PROCESSES, LOCKSTEP = "processes", "lockstep"
+"""Names of the two run folders."""
+STALLS: dict[str, Any] = {"trial.stall": 0.005, "trial.stall_share": 0.02, "trial.stall_spread": 1.0}
+"""Stalls at random: each UAV at one tick in fifty, for up to 10 ms, some dozens of ticks of the others' flight."""
+
+
+class Stopped(Exception):  # noqa: N818  the sentence for the user; the mission has said why
+    """A mission did not come to its end."""
+
+
+class Quiet(Progress):
+    """Shows no progress of a single mission, only its notes."""
+
+    def show(self, status: m.Status) -> None: ...
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of comparing two flights of one mission: facts in each, moves flown, wall seconds."""
+
+    facts: int
+    steps: int
+    seconds: float
+    difference: compare.Difference | None
+
+
+def combinations(
+    base: Mapping[str, Any], actors: list[int], scenarios: list[int], periods: list[int], phases: list[str], seeds: int
+) -> list[Config]:
+    """The config of every combination, each schedule of exchanges once: scenario I and T_u = 1 know no phases."""
+    found: dict[tuple[Any, ...], Config] = {}
+    for n, scenario, period, phase in itertools.product(actors, scenarios, periods, phases):
+        values = {"team.size": n, "scenario": scenario, "comms.period": period, "comms.phase": phase}
+        config = build({**base, **values})
+        schedule = (n, scenario, config.T_u, tuple(config.phase(i) for i in range(n)))
+        found.setdefault(schedule, config)
+    first = build(base).training.seed
+    return [build({"training.seed": first + s}, config) for config in found.values() for s in range(seeds)]
+
+
+def verify(config: Config, policy: bytes | None, folder: Path) -> Outcome:
+    """Fly a mission both ways in `folder`, which is removed when there is no difference. Raises Stopped."""
+    start = time.perf_counter()
+    facts, reference = fly_both(config, policy, folder)
+    difference = compare.first_difference(facts, reference)
+    if difference is None:
+        shutil.rmtree(folder)
+    return Outcome(len(reference), compare.moves(reference), time.perf_counter() - start, difference)
+
+
+def fly_both(config: Config, policy: bytes | None, folder: Path) -> tuple[compare.Facts, compare.Facts]:
+    """The facts of a mission flown as processes, and of the same in lock step; the logs stay in `folder`.
+
+    Raises Stopped; of a mission that the user stopped nothing is left.
+    """
+    world = check(build({"trial.witness": True}, config), policy)
+    try:
+        for name in (PROCESSES, LOCKSTEP):
+            fly(world, policy, folder / name, in_one_process=name == LOCKSTEP)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder)
+        raise
+    return compare.facts_of(folder / PROCESSES), compare.facts_of(folder / LOCKSTEP)
+
+
+def fly(world: World, policy: bytes | None, out: Path, *, in_one_process: bool) -> None:
+    """One flight without a word, unless something is wrong. Raises Stopped when it did not come to its end."""
+    out.mkdir(parents=True)
+    quiet = Quiet(world.config, world.law.cells.size, bound_of(world))
+    code = Mission(world, out, command_line(), policy, quiet).run(in_one_process=in_one_process)
+    if code == process.FAILED:
+        raise Stopped(f"a mission did not come to its end; its logs are in {out}")
+    if code != process.DONE:
+        raise KeyboardInterrupt
+
+
+def cost(config: Config) -> float:
+    """About how long a mission takes, in moves: its own, and the starts of its processes."""
+    return config.team.size * (config.training.ticks * config.training.episodes + 300.0) + 500.0
+
+
+def timed(configs: list[Config]) -> Iterator[tuple[int, Config, float]]:
+    """(number from 1, config, share of all the work that is done before it) of every mission."""
+    total, done = sum(map(cost, configs)), 0.0
+    for number, config in enumerate(configs, 1):
+        yield number, config, done / total
+        done += cost(config)

@@ -1,0 +1,228 @@
+"""`overfly verify chaos`, part by part: the judge sees what is lost, doubled or other; blows, cuts and their seeds."""
+
+from __future__ import annotations
+
+import socket
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from deploy.cli import main
+from deploy.verify.chaos import proxy
+from deploy.verify.chaos.checker import Snapshot, judge
+from deploy.verify.chaos.faults import CUT, KILL, POWER, STOP, blows, role
+from deploy.verify.chaos.power import cut_tails
+from deploy.verify.chaos.proxy import Forwarder
+from deploy.verify.chaos.schedule import Growth, Storm
+from tests.command import PATIENCE
+from tmc.kernel.config import Journal
+from tmc.record import builders
+from tmc.record.builders import record_digest
+from tmc.record.writer import LogWriter
+from tmc.wire import messages as m
+
+NAMES = ["tmc", "learner", "uav-000", "uav-001", "uav-002"]
+NONE = np.zeros(0, "u1")
+
+
+def record(uav: int, sequence: int, cell: int = 7) -> m.Record:
+    cells = np.array([cell], "<u2")
+    return m.Record(uav, 5, sequence, 1, sequence, sequence, 0, 0, cells, NONE, NONE, np.zeros(0, "<f4"),
+                    m.EMPTY, m.EMPTY)  # fmt: skip
+
+
+def prepare(out: Path, journalled: list[m.Record], sworn: list[m.Record]) -> None:
+    """A run folder in which the TMC has journalled these records, and the UAVs have sworn to those."""
+    (out / "oaths").mkdir(parents=True)
+    with LogWriter(out / "tmc.mcap", "tmc", Journal(), {}) as log:
+        for one in journalled:
+            log.write(f"/uav/{one.uav}/record", builders.flight_record(one))
+    for one in sworn:
+        with (out / "oaths" / f"uav-{one.uav:03d}.txt").open("a") as file:
+            file.write(f"{one.sequence} {record_digest(one)}\n")
+
+
+FLOWN = [record(uav, sequence) for sequence in range(4) for uav in range(2)]
+
+
+def test_what_was_sworn_and_is_there_is_neither_lost_nor_doubled(tmp_path: Path) -> None:
+    prepare(tmp_path, FLOWN, [*FLOWN[:6], replace(FLOWN[6], life=99)])  # another life, the same flight
+    found = judge(tmp_path)
+    assert (found.acknowledged, found.journalled, found.lost, found.doubled) == (7, 8, 0, 0)
+
+
+def test_a_lost_record_is_seen(tmp_path: Path) -> None:
+    prepare(tmp_path, FLOWN[:7], FLOWN)
+    found = judge(tmp_path)
+    assert (found.acknowledged, found.journalled, found.lost, found.doubled) == (8, 7, 1, 0)
+
+
+def test_a_doubled_record_is_seen(tmp_path: Path) -> None:
+    prepare(tmp_path, [*FLOWN, FLOWN[3], FLOWN[3], FLOWN[5]], FLOWN)
+    assert (judge(tmp_path).lost, judge(tmp_path).doubled) == (0, 2)
+
+
+def test_another_digest_is_seen(tmp_path: Path) -> None:
+    prepare(tmp_path, [record(0, 0, cell=8), *FLOWN[1:]], FLOWN)
+    assert (judge(tmp_path).lost, judge(tmp_path).doubled) == (1, 0)
+
+
+def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same(tmp_path: Path) -> None:
+    prepare(tmp_path, FLOWN[:4], FLOWN[:7])
+    snapshot = Snapshot.take(tmp_path)
+    (tmp_path / "tmc.mcap").unlink()
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+        for one in FLOWN:
+            log.write(f"/uav/{one.uav}/record", builders.flight_record(one))
+    assert judge(tmp_path).lost == 0
+    assert snapshot.lost() == {(0, 2), (1, 2), (0, 3)}
+    assert judge(tmp_path, [(0, 2), (1, 2), (0, 3)]).lost == 3
+    assert not list((tmp_path / "oaths").glob("killed*"))
+
+
+# Blows.
+
+
+@pytest.mark.parametrize("power", [False, True])
+def test_blows_are_drawn_from_their_seed(power: bool) -> None:
+    drawn = blows(200, 4, NAMES, power=power)
+    assert drawn == blows(200, 4, NAMES, power=power) != blows(200, 5, NAMES, power=power)
+    assert sum(blow.kills for blow in drawn) == 200
+    kinds = Counter(blow.kind for blow in drawn)
+    assert kinds[STOP] > 30 and kinds[CUT] > 30 and (kinds[POWER] > 60 if power else not kinds[POWER])
+    killed = Counter(role(name) for blow in drawn if blow.kind == KILL for name in blow.targets)
+    assert min(killed.values()) > 0.6 * max(killed.values()) and set(killed) == {"tmc", "learner", "uav"}
+    assert any(len(blow.targets) == 2 for blow in drawn) and all(0.1 <= blow.seconds <= 1.0 for blow in drawn)
+
+
+def test_what_a_missions_end_left_of_a_blow_falls_on_the_next_mission(tmp_path: Path) -> None:
+    storm = Storm(blows(1, 1, ["tmc"], power=False), lambda _: None, tmp_path / "diary.txt")
+    assert storm.next is not None
+    blow = storm.next
+    storm.struck()
+    storm.later(replace(blow, targets=()))
+    assert storm.next is None or storm.next.kind != KILL
+    storm.later(blow)
+    assert storm.next == blow
+
+
+def test_updates_that_a_checkpoint_takes_back_are_no_growth() -> None:
+    growth = Growth()
+    status = m.Status("flying", 1, 10, 10, 100, 1, 0.0, 0.0, 0.0, 0, 0, "")
+    for updates in (100, 103, 40, 42):
+        growth.take(replace(status, updates=updates))
+        growth.take(None)
+    assert (growth.ticks, growth.updates) == (0, 5)
+
+
+# A power cut.
+
+
+def test_a_power_cut_leaves_what_was_synced(tmp_path: Path) -> None:
+    journal, draw, left = tmp_path / "tmc.mcap.active", Random(1), set[int]()
+    (tmp_path / "oaths").mkdir()
+    for _ in range(50):
+        journal.write_bytes(bytes(range(200)))
+        (tmp_path / "oaths" / "tmc.txt").write_text(f"7 400\n{journal.stat().st_ino} 120\n")
+        (tmp_path / "uav-000.mcap.active").write_bytes(bytes(100))
+        lost = cut_tails(tmp_path, draw)
+        left.add(journal.stat().st_size)
+        assert journal.stat().st_size == 200 - lost >= 120
+        assert journal.read_bytes() == bytes(range(200))[: 200 - lost]
+    assert len(left) > 20 and (tmp_path / "uav-000.mcap.active").stat().st_size <= 100
+
+
+def test_a_journal_that_was_just_taken_over_was_synced_as_a_whole(tmp_path: Path) -> None:
+    journal = tmp_path / "tmc.mcap.active"
+    journal.write_bytes(bytes(200))
+    (tmp_path / "oaths").mkdir()
+    (tmp_path / "oaths" / "tmc.txt").write_text(f"{journal.stat().st_ino + 1} 20\n")
+    assert cut_tails(tmp_path, Random(1)) == 0 and journal.stat().st_size == 200
+
+
+# The wire.
+
+
+@pytest.fixture
+def line(short: Path) -> Iterator[tuple[Forwarder, socket.socket, Path]]:
+    """A forwarder, the listener behind it, and where it listens itself."""
+    front, back = short / "front", short / "back"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(back))
+        listener.listen()
+        forwarder = Forwarder(front, back)
+        yield forwarder, listener, front
+        forwarder.close()
+
+
+def call(front: Path) -> socket.socket:
+    sock = socket.socket(socket.AF_UNIX)
+    sock.settimeout(PATIENCE)
+    sock.connect(str(front))
+    return sock
+
+
+def test_bytes_pass_both_ways_until_they_are_cut_off(
+    line: tuple[Forwarder, socket.socket, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forwarder, listener, front = line
+    now = [100.0]
+    monkeypatch.setattr(proxy, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with call(front) as client:
+        server, _ = listener.accept()
+        with server:
+            sent = bytes(range(256)) * 1000
+            client.sendall(sent)
+            got = b""
+            while len(got) < len(sent):
+                got += server.recv(65_536)
+            assert got == sent
+            server.sendall(b"back")
+            assert client.recv(10) == b"back"
+            for seed in range(20):  # each cut drops some connections or all
+                forwarder.cut(0.3, Random(seed))
+            assert server.recv(1) == b"" and client.recv(1) == b""
+    with call(front) as refused:
+        assert refused.recv(1) == b""
+    now[0] += 0.31
+    with call(front) as again:
+        listener.settimeout(PATIENCE)
+        server, _ = listener.accept()
+        again.sendall(b"here")
+        assert server.recv(10) == b"here"
+        server.close()
+
+
+def test_a_server_that_is_gone_is_shown_to_the_client(line: tuple[Forwarder, socket.socket, Path]) -> None:
+    _, listener, front = line
+    listener.close()
+    with call(front) as client:
+        assert client.recv(1) == b""
+
+
+# Mistakes.
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--kills", "0"), "--kills must be 1 or more"),
+        (("--mode", "fly", "--who", "planner:genius"), "there is no planner"),
+        (("nonsense",), "there is no preset"),
+        (("--set", "dqn.gama=1"), "there is no setting"),
+        (("--actors", "4000"), "team.size"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, options: tuple[str, ...], text: str
+) -> None:
+    assert main(["verify", "chaos", *options, "--keep", str(tmp_path / "none")]) == 2
+    err = capsys.readouterr().err
+    assert text in err and err.count("\n") == 1
+    assert not (tmp_path / "none").exists()

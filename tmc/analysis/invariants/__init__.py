@@ -1,0 +1,1 @@
+"""The invariants that every journal must satisfy: `overfly log check`."""

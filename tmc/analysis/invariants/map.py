@@ -1,0 +1,130 @@
+"""Invariants of what the TMC made of the records: exchanges, maps, events, uncertainty and the accounts."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from tmc.analysis.invariants.episode_log import UNKNOWN, Evidence
+from tmc.analysis.invariants.flight import Fault
+from tmc.analysis.invariants.recompute import Truth, accounts, law_of, maps_handed_out, start_factor, uncertainty
+from tmc.analysis.invariants.result import Found, close, judged
+
+EXACT = 1e-6
+"""Sums of the journal and of the reckoning are equal up to this, relative where they are above 1."""
+
+
+def exchanges(e: Evidence, _truth: Truth) -> Found:
+    """At each tick at which UAVs are due, once their records are in, one exchange answers these and nobody else."""
+    held = [s.tick for s in e.syncs]
+    faults: list[Fault] = [(b, None, f"an exchange at tick {b} follows one at {a}")
+                           for a, b in pairwise(held) if b <= a]  # fmt: skip
+    for s in e.syncs:
+        due = [i for i in range(e.N) if i not in s.lost and e.world.config.due(i, s.tick)]
+        if s.uavs != due:
+            faults.append((s.tick, None, f"UAVs {s.uavs} are answered, {due} are due"))
+        faults += [(s.tick, i, "its record is not waited for") for i in due if s.reported[i] < s.tick]
+    faults += [(t, None, "no exchange is held, and UAVs were due") for t in _needed(e) - set(held)]
+    return judged(e, len(e.syncs), faults)
+
+
+def _needed(e: Evidence) -> set[int]:
+    """Ticks of exchanges that must have been held: some UAV has flown on from there, or the episode is over."""
+    lost, config = {i for i, *_ in e.lost}, e.world.config
+    upto = [e.T + 1 if e.ended and i not in lost else max(e.reported[i], 0) for i in range(e.N)]
+    return {t for i in range(e.N) for t in range(upto[i]) if config.due(i, t)}
+
+
+def versions(e: Evidence, _truth: Truth) -> Found:
+    """Map versions rise by one an exchange, over all episodes; each record names one that its UAV was given."""
+    version = e.before.version
+    faults: list[Fault] = []
+    for s in e.syncs:
+        version += 1
+        if s.version != version:
+            faults.append((s.tick, None, f"map {s.version} stands where {version} is next"))
+        version = s.version
+    faults += [(r.tick, r.uav, f"it flew by map {r.version}, it was given {r.given}")
+               for r in e.records if r.version != r.given]  # fmt: skip
+    return judged(e, len(e.syncs) + len(e.records), faults)
+
+
+def maps(e: Evidence, _truth: Truth) -> Found:
+    """Scenario II: each exchange hands out the latest visits of all records up to its tick, cell by cell."""
+    if e.world.config.scenario == 1:
+        return judged(e, 0, [(s.tick, None, "a map of visits stands in scenario I") for s in e.syncs
+                             if s.last_visit is not None])  # fmt: skip
+    faults: list[Fault] = []
+    for s, expected in zip(e.syncs, maps_handed_out(e), strict=True):
+        if s.last_visit is None:
+            if e.ended or s is not e.syncs[-1]:
+                faults.append((s.tick, None, "the map of the exchange is missing"))
+            continue
+        for k in np.flatnonzero(s.last_visit != expected)[:1].tolist():
+            faults.append((s.tick, None, f"cell {k} was visited at tick {expected[k]}, not {s.last_visit[k]}"))
+    return judged(e, sum(s.last_visit is not None for s in e.syncs) * e.world.grid.size, faults)
+
+
+def believed(e: Evidence, truth: Truth) -> Found:
+    """An exchange says how uncertain its map is, summed over cells; in scenario I, how many events are on."""
+    law, start = law_of(e.world), start_factor(e)
+    if e.world.config.scenario == 1:
+        values = [float(truth.active[s.tick].sum()) if s.tick <= e.T else np.nan for s in e.syncs]
+    else:
+        values = [float(uncertainty(law, start, m[law.cells], s.tick).sum())
+                  for s, m in zip(e.syncs, maps_handed_out(e), strict=True)]  # fmt: skip
+    wrong = ((s, v) for s, v in zip(e.syncs, values, strict=True) if not close(s.believed, v, EXACT))
+    faults = ((s.tick, None, f"{s.believed:.9g} is logged, the map makes {v:.9g}") for s, v in wrong)
+    return judged(e, len(e.syncs), faults)
+
+
+def events(e: Evidence, truth: Truth) -> Found:
+    """Scenario I: the events that appear are the draws of the seed, where no event was on; none in scenario II."""
+    upto = e.settled()
+    if not e.ended and e.metrics and all(t < e.metrics[-1].first for t, _ in e.events):
+        upto = e.metrics[-1].first - 1  # the journal may end before the last ticks' events
+    drawn = {(t, k) for t, cells in enumerate(truth.events[: upto + 1]) for k in cells}
+    logged = set(e.events)
+    faults: list[Fault] = [(t, None, f"an event in cell {k} was not drawn") for t, k in logged - drawn if t <= upto]
+    faults += [(t, None, f"an event in cell {k} was drawn, and is not logged") for t, k in drawn - logged]
+    if len(logged) < len(e.events):
+        faults.append((None, None, f"{len(e.events) - len(logged)} events are logged twice"))
+    return judged(e, len(drawn), faults)
+
+
+def series(e: Evidence, truth: Truth) -> Found:
+    """The uncertainty by tick, summed over cells, follows from the visits; each tick is told once, in order."""
+    faults, following, facts = list[Fault](), 0, 0
+    for m in e.metrics:
+        if m.first != following or len(m.reward) != len(m.uncertainty):
+            faults.append((m.first, None, f"metrics begin at tick {m.first}, {following} is next"))
+        following = m.first + len(m.uncertainty)
+        for t, value in enumerate(m.uncertainty, m.first):
+            facts += 1
+            if t > e.T or not close(value, truth.uncertainty[t], EXACT):
+                made = truth.uncertainty[t] if t <= e.T else np.nan
+                faults.append((t, None, f"{value:.9g} is logged, the visits make {made:.9g}"))
+        flown = int((e.cells[1:following] != UNKNOWN).sum())
+        if e.begins and m.steps != e.begins[0].steps + flown:
+            faults.append((m.first, None, f"{m.steps} steps are logged, {e.begins[0].steps + flown} were flown"))
+    missing = following <= e.T and e.ended
+    faults += [(following, None, "the uncertainty from here on is missing")] if missing else []
+    return judged(e, facts, faults)
+
+
+def accounting(e: Evidence, truth: Truth) -> Found:
+    """Scenario II: by cell, uncertainty summed over ticks is what it had been without visits, less what each took away;
+    and the sum of all cells is that of the log."""
+    if e.world.config.scenario == 1 or not e.ended:
+        return Found(0)
+    left, right = accounts(e, truth.found)
+    cells = law_of(e.world).cells
+    faults: list[Fault] = [(None, None, f"cell {cells[k]} adds up to {left[k]:.9g}, by its visits to {right[k]:.9g}")
+                           for k in np.flatnonzero(np.abs(left - right) > EXACT)[:1]]  # fmt: skip
+    logged = {t: v for m in e.metrics for t, v in enumerate(m.uncertainty, m.first) if t}
+    total = sum(logged.values())
+    if not abs(total - right.sum()) <= EXACT + 1e-12 * abs(total):
+        faults.append((None, None, f"the log adds up to {total:.9g}, by its visits to {right.sum():.9g}"))
+    visits = int((e.cells[1:] != UNKNOWN).sum())
+    return judged(e, cells.size + visits, faults)

@@ -1,0 +1,52 @@
+"""What an invariant says of an episode: how many facts it compared, and the first that breaks it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tmc.analysis.invariants.episode_log import Evidence
+
+
+@dataclass(frozen=True)
+class Violation:
+    """A fact that cannot be true. `episode`, `tick`, `uav`: where it is, None where that makes no sense."""
+
+    episode: int | None
+    tick: int | None
+    uav: int | None
+    what: str
+
+    def __str__(self) -> str:
+        where = (("episode", self.episode), ("tick", self.tick), ("UAV", self.uav))
+        named = ", ".join(f"{name} {value}" for name, value in where if value is not None)
+        return f"{named}: {self.what}" if named else self.what
+
+
+@dataclass(frozen=True)
+class Found:
+    """Facts compared, and the first violation among them."""
+
+    facts: int
+    violation: Violation | None = None
+
+
+def judged(e: Evidence, facts: int, faults: Iterable[tuple[int | None, int | None, str]]) -> Found:
+    """The first of the faults (tick, UAV, what), by tick."""
+    first = min(faults, key=lambda f: (f[0] is not None, f[0] or 0, f[1] or 0), default=None)
+    return Found(facts, Violation(e.number, *first) if first else None)
+
+
+def places(bad: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """(tick, UAV) of the first tick at which an array by tick and UAV is true; empty when it is nowhere."""
+    ticks = np.flatnonzero(bad.any(axis=1))
+    return [(int(ticks[0]), int(i)) for i in np.flatnonzero(bad[ticks[0]])] if ticks.size else []
+
+
+def close(a: Any, b: Any, tolerance: float) -> NDArray[np.bool_]:
+    """Equal up to a tolerance, of 1 or of the value where that is larger; nothing is close to NaN."""
+    return np.asarray(np.abs(np.subtract(a, b)) <= tolerance * np.maximum(1.0, np.abs(b)))

@@ -1,0 +1,1 @@
+"""Replay files for viewers: `overfly log replay`."""

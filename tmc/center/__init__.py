@@ -1,0 +1,1 @@
+"""The TMC's process: the station, what it holds, its journal, and the service around it."""

@@ -1,0 +1,145 @@
+"""Writes what the station wants journalled into the TMC's MCAP file, and commits it a group at a time.
+
+What is committed survives what `journal.durability` says. Policy files are too large for a journal of thousands of
+them: those still in use lie beside it, in `policies/`, and the journal has their digests.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tmc.center.entries import Entry
+from tmc.center.roster import Outbox
+from tmc.kernel.config import flat
+from tmc.kernel.world import World
+from tmc.record import builders
+from tmc.record.channels import ACTIVE, CHANNELS
+from tmc.record.disk import put
+from tmc.record.schemas import message_class
+from tmc.record.writer import LogWriter
+
+_SCHEMA = {c.topic: c.schema for c in CHANNELS}
+
+
+class Journal:
+    """The file `tmc.mcap` of a run: config and map as attachments, then one message an entry.
+
+    `resume`: go on with the journal that an earlier life of the TMC left in the folder, if it left one (`found`).
+    `timer`: a clock in s that is never set.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        world: World,
+        run: str,
+        *,
+        resume: bool = False,
+        timer: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.world, self.folder = world, folder
+        self._timer, self._started = timer, timer()
+        self.found = resume and journal_in(folder) is not None
+        self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run}, resume=resume)
+        self._policies: set[int] = set()
+        self._stale = {*policies_in(folder)} if self.found else set[int]()
+        self._since: float | None = None
+        if not self.found:
+            self._begin(world)
+        else:  # the writer has synced what it took over
+            self._swear()
+
+    def _begin(self, world: World) -> None:
+        config = json.dumps(flat(world.config), indent=1)
+        self.writer.attach("config.json", "application/json", config.encode())
+        self.writer.attach("map.csv", "text/csv", world.map.csv().encode())
+        if world.map.streets:
+            self.writer.write("/map/roads", builders.geojson(roads_geojson(world)))
+        self.writer.flush()
+
+    def take(self, outbox: Outbox) -> None:
+        """Write the entries and notes of an outbox."""
+        if outbox.entries and self._since is None:
+            self._since = time.monotonic()
+        for entry in outbox.entries:
+            self.writer.write(entry.topic, self._message(entry), entry.sent or None)
+        for level, text in outbox.notes:
+            self.writer.log(level.lower(), text)
+
+    @property
+    def due(self) -> float | None:
+        """Seconds until the entries that are not committed must be; None when all are."""
+        if self._since is None:
+            return None
+        return max(0.0, self._since + self.world.config.journal.commit - time.monotonic())
+
+    def commit(self) -> None:
+        """Hand over all entries so far: to the system, or to the disk."""
+        self.writer.flush(fsync=self.world.config.journal.durability == "power")
+        self._since = None
+        self._swear()
+
+    def _swear(self) -> None:
+        """In a trial with power cuts: how much of which file the disk has, for whoever simulates them."""
+        config = self.world.config
+        if config.trial.oath and config.journal.durability == "power":
+            path = self.folder / "oaths" / "tmc.txt"
+            path.parent.mkdir(exist_ok=True)
+            now = self.writer.active.stat()
+            with path.open("a", encoding="utf-8") as file:
+                file.write(f"{now.st_ino} {now.st_size}\n")
+
+    def keep_policies(self, held: Mapping[int, bytes]) -> None:
+        """Make the folder `policies` hold these policies, and none of those that it held before."""
+        for version in held.keys() - self._policies:
+            path = policy_path(self.folder, version)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            put(path, held[version], sync=self.world.config.journal.durability == "power")
+        for version in (self._policies | self._stale) - held.keys():
+            policy_path(self.folder, version).unlink(missing_ok=True)
+        self._policies, self._stale = set(held), set()
+
+    def _message(self, entry: Entry) -> Any:
+        if "record" in entry.values:
+            return builders.flight_record(entry.values["record"])
+        if entry.topic == "/tmc/last_visit":
+            grid, cell = self.world.grid, self.world.map.cell_m
+            return builders.grid(entry.values["last_visit"], grid.rows, grid.cols, cell, time.time_ns())
+        message = message_class(_SCHEMA[entry.topic])(**entry.values)
+        if entry.topic == "/tmc/metrics":
+            message.elapsed = self._timer() - self._started
+        return message
+
+
+def journal_in(folder: Path) -> Path | None:
+    """The journal in a run folder, finished or left behind; None when there is none, or an empty file."""
+    paths = (folder / f"tmc.mcap{ACTIVE}", folder / "tmc.mcap")
+    return next((path for path in paths if path.is_file() and path.stat().st_size), None)
+
+
+def policy_path(folder: Path, version: int) -> Path:
+    """Where the TMC keeps the policy with this version while a UAV may ask for it."""
+    return folder / "policies" / f"policy-{version}.onnx"
+
+
+def policies_in(folder: Path) -> list[int]:
+    """The versions of the policy files in a run folder."""
+    names = (path.stem.removeprefix("policy-") for path in (folder / "policies").glob("policy-*.onnx"))
+    return [int(name) for name in names if name.isdecimal()]
+
+
+def roads_geojson(world: World) -> str:
+    """The streets as a GeoJSON FeatureCollection, longitude first."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": s.name, "class": s.road_class},
+            "geometry": {"type": "LineString", "coordinates": [list(p) for p in s.lonlat]},
+        }
+        for s in world.map.streets
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": features})

@@ -1,0 +1,239 @@
+"""Recovery by replay: the journal, played through the station, gives the state of the TMC that wrote it.
+
+Only what came from outside is taken from the journal: flight records, policies, who was lost, when episodes began and
+how far the learner was. Everything else follows, and what a kill kept from being written is written then. Of episodes
+so old that the replay memory holds nothing of them, only the sums are taken.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+from tmc.center.entries import Entry
+from tmc.center.episode import RefusedError
+from tmc.center.journal import policy_path
+from tmc.center.roster import Member
+from tmc.center.station import Station
+from tmc.kernel import files
+from tmc.kernel.config import Config
+from tmc.record.builders import to_record
+from tmc.record.errors import RecordError
+from tmc.record.mcap.parser import Raw
+from tmc.record.reader import Log, decode
+
+Taker = Callable[[Station, Any, Path, float], None]
+EPISODE, POLICY = "overfly.Episode", "overfly.Policy"
+
+
+def recover(station: Station, path: Path, now: float) -> list[Entry]:
+    """Bring a new station to the state that the journal at `path` tells of; returns what is missing in the journal.
+
+    RecordError when the journal contradicts itself.
+    """
+    log = Log(path)
+    missing = play(station, log.raw(), path.parent, now, skipped(log, station.config))
+    for i, member in enumerate(station.roster):
+        member.heard = now
+        if station.flight is not None and member.life < 0 and i not in station.flight.lost:
+            member.life = 0  # it has flown nothing yet, so its process is not known: it may be silent for ever
+    station.feed.recovered = True
+    station.committed()
+    station.out.take()
+    return missing
+
+
+def play(
+    station: Station,
+    journal: Iterable[Raw],
+    folder: Path,
+    now: float,
+    skip: range = range(0),
+    watch: Callable[[list[Entry]], None] = lambda _: None,
+) -> list[Entry]:
+    """Play the messages of a journal; returns the entries that follow from them and are not among them.
+
+    `folder` holds the policy files; of the episodes in `skip` only the sums are taken; `watch` is given all entries.
+    """
+    balance, skipping = _Balance(), False
+
+    def keep() -> None:
+        made = station.out.take().entries
+        watch(made)
+        balance.made(made)
+
+    keep()  # a fixed policy is taken before anything is heard
+    station.playing = True
+    try:
+        for raw in journal:
+            message: Any = decode(raw) if raw.schema in _TOLD else None
+            skipping = message.episode in skip if raw.schema == EPISODE else skipping
+            if not skipping or raw.schema == POLICY:
+                balance.written(raw.topic)
+            if message is not None:
+                _take(_SUMS if skipping else _TAKERS, station, message, folder, now)
+                keep()
+        station.settle()
+        keep()
+    finally:
+        station.playing = False
+    return balance.missing()
+
+
+def _take(takers: dict[str, Taker], station: Station, message: Any, folder: Path, now: float) -> None:
+    taker = takers.get(message.DESCRIPTOR.full_name)
+    try:
+        if taker is not None:
+            taker(station, message, folder, now)
+    except RefusedError as refused:
+        raise RecordError(f"the journal contradicts itself, so do not go on with it: {refused}") from None
+
+
+class _Balance:
+    """What the station makes against what is written, by topic: both come in the same order."""
+
+    def __init__(self) -> None:
+        self._written: Counter[str] = Counter()
+        self._made: dict[str, deque[tuple[int, Entry]]] = {}
+        self._count = 0
+
+    def written(self, topic: str) -> None:
+        if made := self._made.get(topic):
+            made.popleft()
+        else:
+            self._written[topic] += 1
+
+    def made(self, entries: list[Entry]) -> None:
+        for entry in entries:
+            self._count += 1
+            if self._written[entry.topic]:
+                self._written[entry.topic] -= 1
+            else:
+                self._made.setdefault(entry.topic, deque()).append((self._count, entry))
+
+    def missing(self) -> list[Entry]:
+        """What was made and is not written, in its order."""
+        left = sorted((item for made in self._made.values() for item in made), key=lambda item: item[0])
+        return [entry for _, entry in left]
+
+
+# Episodes that need not be flown again.
+
+
+def skipped(log: Log, config: Config) -> range:
+    """The episodes of which nothing is left: neither transitions in the replay memory, nor the start of learning."""
+    ended, lost = 0, set[int]()
+    for entry in log.entries(("/tmc/episode", "/tmc/lost")):
+        if entry.topic == "/tmc/lost":
+            lost.add(entry.message.episode)
+        elif entry.message.phase == "end":
+            ended = entry.message.episode
+    # Transitions by episode, of one UAV; around a loss some are left out, so such an episode counts as none.
+    starts = [0 if e in lost else config.training.ticks for e in range(1, ended + 1)]
+    team, needed = config.team.size, config.replay.learn_start
+    head = next((e for e, sum_ in enumerate(accumulate(starts), 1) if sum_ * team >= needed), ended)
+    kept = config.replay.capacity // team
+    tail = next((n for n, sum_ in enumerate(accumulate(reversed(starts)), 1) if sum_ >= max(kept, 1)), ended)
+    return range(head + 1, ended - tail + 1)
+
+
+def _sum_episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    if message.phase == "begin":
+        return
+    _in_turn(station, message)
+    blocked = (message.blocked_grid, message.blocked_obstacle, message.blocked_uav)
+    station.episodes, station.steps = message.episode, message.steps
+    station.ticks += message.ticks
+    station.limiter.ticks += message.ticks
+    station.limiter.updates = message.updates
+    station.blocked += sum(blocked)
+    station.blocked_by_uav += message.blocked_uav
+
+
+def _sum_record(station: Station, message: Any, _folder: Path, now: float) -> None:
+    _next_of(station, message, now).sequence += 1
+
+
+def _sum_sync(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    station.version = message.version
+
+
+# Episodes that are flown again.
+
+
+def _in_turn(station: Station, message: Any) -> None:
+    if station.flight is not None or station.episodes != message.episode - 1:
+        raise RecordError(f"the journal has episode {message.episode} out of turn: do not go on with it")
+
+
+def _next_of(station: Station, message: Any, now: float) -> Member:
+    """The UAV whose next record this is, and its process."""
+    team = station.roster
+    if message.uav >= len(team) or message.sequence != team[message.uav].sequence:
+        text = f"the journal has record {message.sequence} of UAV {message.uav} out of turn: do not go on with it"
+        raise RecordError(text)
+    member: Member = team[message.uav]
+    member.live(message.life, now)
+    return member
+
+
+def _episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    begun = station.flight is not None and station.flight.episode == message.episode
+    if message.phase == "begin" and not begun:
+        _in_turn(station, message)
+        station.begin_episode([])
+    elif message.phase == "end":
+        station.settle()
+
+
+def _record(station: Station, message: Any, _folder: Path, now: float) -> None:
+    record, flight = to_record(message), station.flight
+    _next_of(station, message, now)
+    if flight is None or record.episode != flight.episode:
+        raise RecordError(f"the journal has a record of episode {record.episode} out of turn: do not go on with it")
+    station.accept(flight, record)
+
+
+def _lost(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    flight, uav = station.flight, message.uav
+    if flight is not None and uav < flight.N and uav not in flight.lost:
+        station.lose(flight, uav)
+
+
+def _policy(station: Station, message: Any, folder: Path, _now: float) -> None:
+    if message.version > station.policies.newest:
+        station.take_policy(message.version, _model(message, folder), message.updates, message.loss)
+
+
+def _model(message: Any, folder: Path) -> bytes:
+    """The policy file, if it is still there and whole."""
+    try:
+        model = bytes(message.model) or files.read_bytes(policy_path(folder, message.version))
+    except OSError:
+        return b""
+    return model if hashlib.sha256(model).hexdigest() == message.sha256 else b""
+
+
+def _metrics(station: Station, message: Any, _folder: Path, _now: float) -> None:
+    station.settle()  # here the TMC did; in between it may have taken any number of records
+    station.limiter.updates = message.updates
+
+
+_TAKERS: dict[str, Taker] = {
+    EPISODE: _episode,
+    POLICY: _policy,
+    "overfly.FlightRecord": _record,
+    "overfly.Lost": _lost,
+    "overfly.TeamMetrics": _metrics,
+}
+_SUMS: dict[str, Taker] = {
+    EPISODE: _sum_episode,
+    POLICY: _policy,
+    "overfly.FlightRecord": _sum_record,
+    "overfly.Sync": _sum_sync,
+}
+_TOLD = _TAKERS.keys() | _SUMS.keys()

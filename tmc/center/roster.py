@@ -1,0 +1,122 @@
+"""Who takes part in a mission, as the TMC knows them, and what the TMC has for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from tmc.center import entries
+from tmc.wire import messages as m
+
+LEARNER = "learner"
+
+
+def uav_name(i: int) -> str:
+    """The address of UAV i's process."""
+    return f"uav-{i:03d}"
+
+
+@dataclass
+class Outbox:
+    """What the core wants done: messages to send, entries to journal, notes for the log. The service empties it."""
+
+    sends: list[tuple[str, m.Message]] = field(default_factory=list)
+    entries: list[entries.Entry] = field(default_factory=list)
+    notes: list[tuple[str, str]] = field(default_factory=list)
+
+    def take_sends(self) -> list[tuple[str, m.Message]]:
+        """The messages alone."""
+        taken, self.sends = self.sends, []
+        return taken
+
+    def take_entries(self) -> Outbox:
+        """The entries and notes alone."""
+        taken = Outbox([], self.entries, self.notes)
+        self.entries, self.notes = [], []
+        return taken
+
+    def take(self) -> Outbox:
+        """All of it; this outbox is empty afterwards."""
+        taken = Outbox(self.sends, self.entries, self.notes)
+        self.sends, self.entries, self.notes = [], [], []
+        return taken
+
+
+@dataclass
+class Member:
+    """A UAV on the roster: its process's life, the lives before it, when it was last heard of, its last answer.
+
+    `sequence`: of its next record; `durable`: its records below this number are in the journal for good; `policy`: the
+    version that it was told to fly. Its next process flies that too: peers may have seen what the last one flew.
+    """
+
+    life: int = -1
+    past: set[int] = field(default_factory=set)
+    heard: float = 0.0
+    sequence: int = 0
+    durable: int = 0
+    policy: int = 0
+    answer: m.Map | None = None
+    named: bool = False
+
+    def live(self, life: int, now: float) -> bool:
+        """Heard at `now` of the process `life`; True when it takes the place of another one."""
+        new = self.life not in {-1, life}
+        if new:
+            self.past.add(self.life)
+        self.life, self.heard, self.named = life, now, False
+        return new
+
+
+def away(members: list[Member]) -> list[int]:
+    """UAVs without a process."""
+    return [i for i, member in enumerate(members) if member.life < 0]
+
+
+def name_some(names: list[str]) -> str:
+    """The first ten names, and how many more there are."""
+    return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+
+
+def silent(members: list[Member], now: float, patience: float) -> list[int]:
+    """UAVs with a process that was not heard of for `patience` seconds, each named once in its silence."""
+    found = [i for i in long_silent(members, now, patience) if not members[i].named]
+    for i in found:
+        members[i].named = True
+    return found
+
+
+def long_silent(members: list[Member], now: float, patience: float) -> list[int]:
+    """UAVs with a process that was not heard of for `patience` seconds."""
+    return [i for i, m in enumerate(members) if m.life >= 0 and now - m.heard > patience]
+
+
+def excuse(members: list[Member], pause: float, now: float) -> None:
+    """Nobody could be heard for `pause` seconds before `now`: they are no silence of anybody's."""
+    for member in members:
+        member.heard = min(member.heard + pause, now)
+
+
+Problem = tuple[str, str] | None
+"""Error code and sentence, or None when all is well."""
+
+
+def hello_problem(members: list[Member], sender: str, hello: m.Hello) -> Problem:
+    """Why a UAV cannot say hello: another name than its own, or a life that a newer one took the place of."""
+    if not 0 <= hello.uav < len(members) or sender != uav_name(hello.uav):
+        return "refused", f"{sender} is no name for UAV {hello.uav} of a team of {len(members)}"
+    if hello.life in members[hello.uav].past:
+        return "fenced", f"a newer process flies {sender}: leave"
+    return None
+
+
+def record_problem(members: list[Member], sender: str, record: m.Record) -> Problem:
+    """Why a UAV cannot ship a record: not its own, not known here, or of an older life."""
+    if not 0 <= record.uav < len(members) or sender != uav_name(record.uav):
+        return "refused", f"{sender} cannot ship a record of UAV {record.uav}"
+    if members[record.uav].life < 0:
+        return "state", f"{sender} is not known here: say hello first"
+    if record.life in members[record.uav].past:
+        return "fenced", f"a newer process flies {sender}: leave"
+    if record.life != members[record.uav].life:  # it said hello to an earlier life of the TMC
+        return "state", f"this process of {sender} is not known here: say hello first"
+    return None

@@ -1,0 +1,1 @@
+"""The bytes of MCAP files: parsing, repair, and rewriting."""

@@ -1,0 +1,126 @@
+"""Makes a sound, finished log of a file that was cut or damaged: `overfly log recover`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import chain, count
+from pathlib import Path
+from typing import IO
+
+from mcap.records import Metadata
+
+from tmc.kernel.config import Journal
+from tmc.record import disk
+from tmc.record.channels import ACTIVE
+from tmc.record.errors import NoLogError, RecordError
+from tmc.record.mcap import rewrite
+from tmc.record.mcap.findings import Findings, Item, Show, unseen
+from tmc.record.mcap.parser import RECOVERED
+from tmc.record.mcap.salvage import salvage
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What came of one file; `out` is None where there was nothing to do."""
+
+    path: Path
+    out: Path | None
+    found: Findings
+
+    @property
+    def clean(self) -> bool:
+        """Nothing that the file held is lost."""
+        return self.found.whole
+
+    def lines(self) -> Iterator[str]:
+        """What the user is told."""
+        found = self.found
+        if self.out is None:
+            yield f"{self.path}: sound and finished, {found.messages:,} messages; there is nothing to do"
+            return
+        yield f"{self.path}: {found.messages:,} messages are sound; they are in {self.out}"
+        yield from (f"  {note}" for note in found.notes)
+        yield from (f"  lost {part}" for part in losses(found))
+        if self.clean:
+            yield "  nothing is lost" + ("" if found.finished else "; it was not closed")
+
+
+def losses(found: Findings) -> Iterator[str]:
+    """What is lost, a phrase each."""
+    yield from map(str, found.lost)
+    if found.missing:
+        yield f"{found.missing:,} messages, as the numbers of the others tell"
+    if found.nameless:
+        yield f"{found.nameless:,} sound messages whose topics were described in what is lost"
+
+
+def recovered_name(path: Path) -> Path:
+    """`X.recovered.mcap` for X.mcap and for X.mcap.active."""
+    return path.with_name(path.name.partition(".mcap")[0] + ".recovered.mcap")
+
+
+def finished_name(path: Path) -> Path:
+    """The name of the finished log that a file is, or was to become."""
+    return path.with_name(path.name.removesuffix(ACTIVE))
+
+
+def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show: Show = unseen) -> Recovery:
+    """Write what is sound in `path` to `out` (by default beside it), or put it in its place.
+
+    In place, a file from which something is lost is kept as `*.damaged-1`. RecordError when nothing can be read, when
+    the result cannot be written, or when a process still writes the file.
+    """
+    with closing(held(path)):
+        found = survey(path, show)
+        if found.finished and found.whole and not found.notes:
+            return Recovery(path, None, found)
+        target = finished_name(path) if in_place else out or recovered_name(path)
+        if os.path.lexists(target) and not (in_place and target == path):
+            mend = "remove the one that you do not want" if in_place else "choose another --out, or remove it"
+            raise RecordError(f"{target} exists already: {mend}")
+
+        def before_it_is_replaced(_new: Path) -> None:
+            if in_place and not found.whole:
+                keep(path)
+
+        items = chain(_mark(found), salvage(path, "writing what is sound in", show)[1])
+        rewrite.write(target, Journal().chunk, found.profile, items, before_it_is_replaced)
+        if in_place and target != path:
+            path.unlink()
+    return Recovery(path, target, found)
+
+
+def held(path: Path) -> IO[bytes]:
+    """The file, kept from being written by others until it is closed."""
+    try:
+        file: IO[bytes] = disk.open_held(path, "rb")
+    except OSError as error:
+        raise NoLogError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
+    return file
+
+
+def survey(path: Path, show: Show) -> Findings:
+    """Read all of a file; NoLogError when there is nothing sound in it."""
+    found, items = salvage(path, "reading", show)
+    sound = sum(1 for _ in items)
+    if not sound and not (found.finished and found.whole):
+        raise NoLogError(f"{path} holds nothing that is sound: it is no MCAP file, or damaged all over")
+    return found
+
+
+def keep(path: Path) -> Path:
+    """Keep a damaged file under another name, which is returned: there may be more in it than we can read."""
+    names = (path.with_name(f"{path.name}.damaged-{n}") for n in count(1))
+    kept = next(name for name in names if not name.exists())
+    kept.hardlink_to(path)
+    return kept
+
+
+def _mark(found: Findings) -> Iterator[Item]:
+    """Tells readers that messages are missing, and how many are known to be; nothing where nothing is lost."""
+    if not found.whole:
+        facts = {"lost": "; ".join(losses(found)), "messages_missing": str(found.missing)}
+        yield Metadata(name=RECOVERED, metadata=facts)
