@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.airspace import Airspace, Tracks
-from actors.planners import Decider, Sight, Valued
+from actors.planners import Controller, LocalState, QController
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import FlightError, PolicyError
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.uncertainty import merge
@@ -25,7 +25,7 @@ from tmc.kernel.world import World
 from tmc.wire.messages import EMPTY, Begin, Lost, Map, Policy, PolicyRequest, Record
 
 NONE: NDArray[np.float32] = np.zeros(0, "<f4")
-STINT = 32
+MAX_TICKS_PER_ADVANCE = 32
 """Ticks that a pilot flies at most before it looks up."""
 
 
@@ -45,7 +45,7 @@ class Phase(Enum):
 
 
 @dataclass
-class Leg:
+class RecordBuilder:
     """What was flown since the last record."""
 
     first: int
@@ -58,7 +58,7 @@ class Leg:
 
 
 class Pilot:
-    """UAV `uav` of a world. `make_decider` turns the bytes of a policy file into a Decider; a planner needs none.
+    """UAV `uav` of a world. `make_controller` turns the bytes of a policy file into a Controller; a planner needs none.
 
     `clock`: the wall clock in ns that records are stamped with; 0 where there is none.
     """
@@ -67,26 +67,26 @@ class Pilot:
         self,
         world: World,
         uav: int,
-        life: int,
+        incarnation: int,
         tracks: Tracks,
-        observer: Observer,
-        make_decider: Callable[[bytes], Decider],
-        planner: Decider | None = None,
+        observer: ObservationBuilder,
+        make_controller: Callable[[bytes], Controller],
+        planner: Controller | None = None,
         clock: Callable[[], int] = lambda: 0,
     ) -> None:
-        self.world, self.uav, self.life, self.observer = world, uav, life, observer
+        self.world, self.uav, self.incarnation, self.observer = world, uav, incarnation, observer
         self.config, self.law = world.config, world.law
         self.airspace = Airspace(uav, self.config.team.size, world.grid, observer.sensing, tracks)
         self.reward, self._clock = RewardLaw(self.config, world.law.q), clock
-        self.decider, self._make_decider, self._planner = planner, make_decider, planner
-        self._valued: Valued | None = None
-        """The policy, where each move is told with what it is worth (`replay.priority`)."""
+        self.controller, self._make_controller, self._planner = planner, make_controller, planner
+        self._q_controller: QController | None = None
+        """The policy, where each move is told with what it is worth (`replay.priority_exponent`)."""
         self.phase = Phase.IDLE
         self.episode = self.t = self.cell = self.previous = self.sequence = self.version = 0
         self.policy = self.wanted = 0
         self.explored = self.steps = 0
         self.pending: Record | None = None
-        self.spool: list[Record] = []
+        self.unacknowledged: list[Record] = []
         """Records that the TMC has not acknowledged as journalled for good."""
 
     # Messages in.
@@ -98,7 +98,7 @@ class Pilot:
         track = begin.track.tolist()
         self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, track[-1], track[-2:][0]
         self.sequence, self.version = begin.sequence, begin.version
-        self.spool = [r for r in self.spool if r.sequence < begin.sequence]
+        self.unacknowledged = [r for r in self.unacknowledged if r.sequence < begin.sequence]
         self.airspace.begin(self.episode, self.world.starts(self.episode))
         for uav in begin.lost.tolist():
             self.airspace.lose(uav)
@@ -109,10 +109,10 @@ class Pilot:
         self.active = np.zeros(self.world.grid.size, bool)
         self.visited = set(track)
         self.shipped = begin.shipped
-        self.leg = Leg(begin.shipped + 1)
+        self.builder = RecordBuilder(begin.shipped + 1)
         self.pending, self._answered = None, False
         if begin.shipped < 0:
-            self.leg.cells.append(self.cell)
+            self.builder.cells.append(self.cell)
         for tick, cell in enumerate(track):  # a process that was started again says again where it was
             self.airspace.tracks.publish(tick, cell)
         return self._want(begin.policy, Phase.SENSE)
@@ -132,14 +132,16 @@ class Pilot:
         return self._want(answer.policy, Phase.ACT if self.phase is Phase.MAP else Phase.SENSE)
 
     def acknowledge(self, sequence: int) -> list[Record]:
-        """The TMC has the records below `sequence` for good; returns those of them that were still in the spool."""
-        done = [r for r in self.spool if r.sequence < sequence]
-        self.spool = self.spool[len(done) :]
+        """The TMC has the records below `sequence` for good; returns those of them that were still in the
+        unacknowledged.
+        """
+        done = [r for r in self.unacknowledged if r.sequence < sequence]
+        self.unacknowledged = self.unacknowledged[len(done) :]
         return done
 
-    def missed(self, sequence: int) -> list[Record]:
+    def records_from(self, sequence: int) -> list[Record]:
         """What to send again to a TMC whose next record of this UAV is `sequence`. Raises LostRecordsError."""
-        again = [r for r in self.spool if r.sequence >= sequence]
+        again = [r for r in self.unacknowledged if r.sequence >= sequence]
         if len(again) < self.sequence - sequence:
             raise LostRecordsError(f"the TMC asks for record {sequence}, which it had acknowledged")
         return again
@@ -161,12 +163,12 @@ class Pilot:
         """The policy that was asked for. Raises PolicyError when it cannot fly here."""
         if self.phase is Phase.POLICY and policy.version >= self.wanted:
             try:
-                self.decider = self._make_decider(policy.model)
+                self.controller = self._make_controller(policy.model)
             except PolicyError as error:
                 raise PolicyError(f"UAV {self.uav} cannot fly policy {policy.version}: {error}") from None
-            if self.config.replay.priority:
-                assert isinstance(self.decider, Valued)
-                self._valued = self.decider
+            if self.config.replay.priority_exponent:
+                assert isinstance(self.controller, QController)
+                self._q_controller = self.controller
             self.policy, self.phase = policy.version, self._then
 
     # Flying.
@@ -176,7 +178,7 @@ class Pilot:
 
         Also returns after some ticks without either, so that whoever calls can listen and be heard (`under_way`).
         """
-        until = self.t + STINT
+        until = self.t + MAX_TICKS_PER_ADVANCE
         while self.t < until:
             if self.phase is Phase.SENSE:
                 if self._sense():
@@ -209,25 +211,25 @@ class Pilot:
                 self.last_visit[index[cell]] = self.t
         due, fresh = self.config.due(self.uav, self.t), self.t > self.shipped
         if fresh:  # a flight taken up again stands at a tick that the TMC has
-            self.leg.seen.extend((self.t, cell) for cell in self.peers)
+            self.builder.seen.extend((self.t, cell) for cell in self.peers)
         self.phase = Phase.MAP if due and not self._answered else Phase.ACT
         return due and fresh
 
     def _ship(self) -> Record:
-        leg = self.leg
+        leg = self.builder
         seen = np.array(leg.seen, "<u2").reshape(-1, 2) if leg.seen else None
         self.pending = Record(
-            self.uav, self.life, self.sequence, self.episode, leg.first, self.t, self.version, self.policy,
+            self.uav, self.incarnation, self.sequence, self.episode, leg.first, self.t, self.version, self.policy,
             np.array(leg.cells, "<u2"), np.array(leg.actions, "u1"), np.array(leg.blocks, "u1"),
             np.array(leg.rewards, "<f4"),
             EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
             np.array(leg.values, "<f4") if leg.values else NONE,
             self._clock(),
         )  # fmt: skip
-        self.spool.append(self.pending)
+        self.unacknowledged.append(self.pending)
         self.sequence += 1
         self.shipped = self.t
-        self.leg = Leg(self.t + 1)
+        self.builder = RecordBuilder(self.t + 1)
         return self.pending
 
     def map_of(self, t: int) -> NDArray[np.float64]:
@@ -236,11 +238,11 @@ class Pilot:
             return self.active[self.law.cells].astype(np.float64)
         return self.law.values(self.last_visit, t, self._factor)
 
-    def sight(self) -> Sight:
+    def state(self) -> LocalState:
         """What this UAV knows at t."""
         allowed = self.observer.allowed(self.cell, self.peers)
         draw = self._draws[self.t][1]
-        return Sight(self.t, self.cell, self.previous, self.peers, self.map_of(self.t), allowed, draw)
+        return LocalState(self.t, self.cell, self.previous, self.peers, self.map_of(self.t), allowed, draw)
 
     def _act(self) -> None:
         """Choose a(t), epsilon-greedy; at the end of the episode there is nothing left to do."""
@@ -256,18 +258,18 @@ class Pilot:
 
     def _decide(self, explore: float, draw: float) -> None:
         """Choose by the draws of the tick: the action, and what it is worth where records tell so."""
-        sight = None
+        state = None
         if self._planner is None and explore < self._epsilon:
             self.explored += 1
             mask = self.config.exploration.mask_blocked
             choices = self.observer.allowed(self.cell, self.peers) if mask else range(N_ACTIONS)
             self.action = choices[int(draw * len(choices))]
         else:
-            assert self.decider is not None
-            sight = self.sight()
-            self.action = self.decider.choose(sight)
-        if self._valued is not None:
-            self.leg.values += self._valued.worth(sight or self.sight(), self.action)
+            assert self.controller is not None
+            state = self.state()
+            self.action = self.controller.choose(state)
+        if self._q_controller is not None:
+            self.builder.values += self._q_controller.q_of(state or self.state(), self.action)
 
     def _move(self) -> None:
         cell, block = self.world.moves[self.cell][self.action]
@@ -275,13 +277,13 @@ class Pilot:
             cell, block = self.cell, Block.UAV
         k = self.law.index_list[cell]
         u = self._before_visit(k, cell) if k >= 0 else 0.0
-        self.leg.rewards.append(self.reward(bool(block), cell not in self.visited, k, u))
+        self.builder.rewards.append(self.reward(bool(block), cell not in self.visited, k, u))
         self.visited.add(cell)
         self.t, self.cell, self.previous, self._answered = self.t + 1, cell, self.cell, False
         self.airspace.tracks.publish(self.t, cell)
-        self.leg.cells.append(cell)
-        self.leg.actions.append(self.action)
-        self.leg.blocks.append(block)
+        self.builder.cells.append(cell)
+        self.builder.actions.append(self.action)
+        self.builder.blocks.append(block)
         self.steps += 1
         self.phase = Phase.SENSE
 

@@ -14,7 +14,7 @@ from tmc.kernel.world import World
 
 
 @dataclass(frozen=True)
-class Sight:
+class LocalState:
     """What a UAV knows when it decides: its cell and the one before, the cells of sensed peers, its map `u` (R,), the
     moves that nothing known blocks, and one draw in [0, 1) of its own."""
 
@@ -27,22 +27,22 @@ class Sight:
     draw: float
 
 
-class Decider(Protocol):
+class Controller(Protocol):
     """A policy or a planner: chooses an action id."""
 
-    def choose(self, sight: Sight) -> int: ...
+    def choose(self, state: LocalState) -> int: ...
 
 
 @runtime_checkable
-class Valued(Decider, Protocol):
+class QController(Controller, Protocol):
     """A policy: it also knows what actions are worth."""
 
-    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+    def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
         """Q(o, a), and the largest Q(o, .) of an action that may be chosen."""
         ...
 
 
-Planner = Callable[[World, Sight], int]
+Planner = Callable[[World, LocalState], int]
 
 
 def pick(choices: list[int], draw: float) -> int:
@@ -50,42 +50,42 @@ def pick(choices: list[int], draw: float) -> int:
     return choices[int(draw * len(choices))]
 
 
-def random(_world: World, sight: Sight) -> int:
+def random(_world: World, state: LocalState) -> int:
     """Any of the nine actions, blocked or not: what exploration alone does."""
-    return pick(list(range(N_ACTIONS)), sight.draw)
+    return pick(list(range(N_ACTIONS)), state.draw)
 
 
-def random_road(world: World, sight: Sight) -> int:
+def random_road(world: World, state: LocalState) -> int:
     """A random move along the road that does not turn back unless it must; off the road, a move nearer to it."""
-    targets = world.grid.target_lists[sight.cell]
-    onward = [a for a in sight.allowed if a != STAY and targets[a] != sight.previous]
+    targets = world.grid.target_lists[state.cell]
+    onward = [a for a in state.allowed if a != STAY and targets[a] != state.previous]
     road = [a for a in onward if world.map.road[targets[a]]]
-    return _nearest_to_road(world, sight, road or [a for a in sight.allowed if a != STAY] or [STAY])
+    return _nearest_to_road(world, state, road or [a for a in state.allowed if a != STAY] or [STAY])
 
 
-def greedy(world: World, sight: Sight) -> int:
+def greedy(world: World, state: LocalState) -> int:
     """The best of the nine cells by the UAV's own map; ties go to the cell nearest to the road, then to the draw."""
-    index, targets = world.law.index_list, world.grid.target_lists[sight.cell]
-    u = [float(sight.u[index[targets[a]]]) if index[targets[a]] >= 0 else 0.0 for a in sight.allowed]
+    index, targets = world.law.index_list, world.grid.target_lists[state.cell]
+    u = [float(state.u[index[targets[a]]]) if index[targets[a]] >= 0 else 0.0 for a in state.allowed]
     best = max(u)
-    return _nearest_to_road(world, sight, [a for a, value in zip(sight.allowed, u, strict=True) if value == best])
+    return _nearest_to_road(world, state, [a for a, value in zip(state.allowed, u, strict=True) if value == best])
 
 
-def _nearest_to_road(world: World, sight: Sight, choices: list[int]) -> int:
-    distance, targets = world.map.road_distance, world.grid.target_lists[sight.cell]
+def _nearest_to_road(world: World, state: LocalState, choices: list[int]) -> int:
+    distance, targets = world.map.road_distance, world.grid.target_lists[state.cell]
     away = [int(distance[targets[a]]) for a in choices]
-    return pick([a for a, d in zip(choices, away, strict=True) if d == min(away)], sight.draw)
+    return pick([a for a, d in zip(choices, away, strict=True) if d == min(away)], state.draw)
 
 
 PLANNERS: dict[str, Planner] = {"random": random, "random-road": random_road, "greedy": greedy}
 PREFIX = "planner:"
 
 
-class PlannerDecider:
-    """A planner in a world, as a Decider."""
+class PlannerController:
+    """A planner in a world, as a Controller."""
 
     def __init__(self, world: World, name: str) -> None:
         self._world, self._planner = world, PLANNERS[name.removeprefix(PREFIX)]
 
-    def choose(self, sight: Sight) -> int:
-        return self._planner(self._world, sight)
+    def choose(self, state: LocalState) -> int:
+        return self._planner(self._world, state)

@@ -12,10 +12,10 @@ import numpy as np
 import onnxruntime as ort
 
 from actors.modelfile import check_kind, check_shapes, reason
-from actors.planners import Sight
+from actors.planners import LocalState
 from tmc.kernel.config import Config
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import INPUT, KEY, OUTPUT, FlightError, PolicyCard, PolicyError, require
 
 
@@ -44,17 +44,17 @@ def read_card(model: bytes) -> PolicyCard:
     return open_model(model)[1]
 
 
-class NetworkDecider:
+class PolicyController:
     """argmax_a Q(o, a; theta), over the allowed actions when the policy was trained to mask blocked moves."""
 
-    def __init__(self, model: bytes, config: Config, observer: Observer) -> None:
+    def __init__(self, model: bytes, config: Config, observer: ObservationBuilder) -> None:
         self._session, card = open_model(model)
         require(card, config, observer.grid)
         self._mask, self._canvas = config.exploration.mask_blocked, observer.canvas()
         self._q = np.zeros((1, N_ACTIONS), np.float32)
         self._values: list[float] = []
         """Q of the nine actions in `_seen`."""
-        self._seen: Sight | None = None
+        self._seen: LocalState | None = None
         self._bound = self._bind()
         self._check(observer)
 
@@ -66,7 +66,7 @@ class NetworkDecider:
         bound.bind_output(OUTPUT, "cpu", 0, np.float32, q.shape, q.ctypes.data)
         return bound
 
-    def _check(self, observer: Observer) -> None:
+    def _check(self, observer: ObservationBuilder) -> None:
         """Refuse a model that cannot be run, or not again with the same values. What these are shows in flight only."""
         self._canvas.draw(observer.first_cell, [], np.zeros(observer.R))
         try:
@@ -89,21 +89,21 @@ class NetworkDecider:
         q: np.ndarray[Any, np.dtype[np.float32]] = self._q[0]
         return q
 
-    def choose(self, sight: Sight) -> int:
-        q = self._look(sight)
+    def choose(self, state: LocalState) -> int:
+        q = self._look(state)
         if self._mask:
-            return max(sight.allowed, key=q.__getitem__)
+            return max(state.allowed, key=q.__getitem__)
         return q.index(max(q))
 
-    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+    def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
         """Q(o, a), and the largest Q(o, .) among the actions that `choose` chooses from."""
-        q = self._look(sight)
-        return q[action], max(q[a] for a in sight.allowed) if self._mask else max(q)
+        q = self._look(state)
+        return q[action], max(q[a] for a in state.allowed) if self._mask else max(q)
 
-    def _look(self, sight: Sight) -> list[float]:
-        """Q of what is in sight; who asks again about the last one gets what was computed. Raises FlightError."""
-        if sight is not self._seen:
-            self._canvas.draw(sight.cell, sight.peers, sight.u)
+    def _look(self, state: LocalState) -> list[float]:
+        """Q of what is in state; who asks again about the last one gets what was computed. Raises FlightError."""
+        if state is not self._seen:
+            self._canvas.draw(state.cell, state.peers, state.u)
             try:
                 values: list[float] = self.q_values().tolist()
             except Exception as error:  # as above: what a model does may depend on what it sees
@@ -112,5 +112,5 @@ class NetworkDecider:
             if total - total != 0.0:  # a value that is not finite makes the sum of them so, and no other can
                 shown = ", ".join(f"{value:.3g}" for value in values)
                 raise FlightError(f"gave values that are not finite ({shown})")
-            self._values, self._seen = values, sight
+            self._values, self._seen = values, state
         return self._values

@@ -13,15 +13,15 @@ from typing import Any, NoReturn
 import zmq
 
 from actors.airspace import Tracks, Waiting
-from actors.observation_hash import Oath, Witness
+from actors.observation_hash import AckLog, ObservationHasher
 from actors.pilot import LostRecordsError, Phase, Pilot
-from actors.planners import PREFIX, Decider, PlannerDecider
+from actors.planners import PREFIX, Controller, PlannerController
 from actors.radio import RadioTracks
 from actors.stalls import Lead, StallingTracks, stalls
 from actors.tracks import TableTracks, open_table
 from tmc.kernel.config import build
 from tmc.kernel.files import plain
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
 from tmc.record.builders import location_fix
 from tmc.record.channels import ACTIVE, uav_topic
@@ -32,13 +32,13 @@ from tmc.wire import messages as m
 from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
 
-SILENCE = (0.25, 0.5)
+RETRY_BACKOFF_S = (0.25, 0.5)
 """Seconds after which a message that was not answered goes out again: at first, and at most; doubles in between."""
-ASK_EVERY = 0.2
+ASK_INTERVAL_S = 0.2
 """Seconds after which a UAV that waits for a peer's beacon asks for it, and asks again."""
-STATUS_EVERY = 0.5
+STATUS_INTERVAL_S = 0.5
 """Seconds between two status messages in the log."""
-NAP = 0.02
+PEER_POLL_S = 0.02
 """Seconds that a wait for a peer's track sleeps before it looks at what the TMC sent; ten times as long in a long wait,
 which costs less than 1 % of a core."""
 
@@ -62,7 +62,7 @@ class Service:
 
     def __init__(self, uav: int, endpoint: str, out: Path) -> None:
         self.uav, self.endpoint, self.out = uav, endpoint, out
-        self.life = int.from_bytes(os.urandom(7), "big")
+        self.incarnation = int.from_bytes(os.urandom(7), "big")
         self.context: zmq.Context[Any] = zmq.Context()
         self.sock = sockets.dealer(self.context, endpoint, f"uav-{uav:03d}")
         self.log: LogWriter | None = None
@@ -70,9 +70,9 @@ class Service:
         self.waited, self._peer = 0.0, -1
         self.table: TableTracks | None = None
         self.lead: Lead | None = None
-        self.witness: Witness | None = None
-        self.oath: Oath | None = None
-        self._said, self._silence = time.monotonic(), SILENCE[0]
+        self.hasher: ObservationHasher | None = None
+        self.ack_log: AckLog | None = None
+        self._said, self._silence = time.monotonic(), RETRY_BACKOFF_S[0]
         self._reported, self._status_due, self._asked, self._ask_at = (self._said, 0), 0.0, 0.0, 0.0
 
     def fly(self, stop: Callable[[], bool]) -> NoReturn:
@@ -98,12 +98,12 @@ class Service:
 
     def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
         """Say hello until the TMC answers, and build the pilot of the mission that it names."""
-        hello = m.Hello("uav", self.uav, self.life)
+        hello = m.Hello("uav", self.uav, self.incarnation)
         while not stop():
             if self.reminder.due():
                 process.note(f"UAV {self.uav} waits for a TMC at {sockets.waiting(self.endpoint)}")
             self.say(hello)
-            if self.sock.poll(int(SILENCE[0] * 1000)):
+            if self.sock.poll(int(RETRY_BACKOFF_S[0] * 1000)):
                 message = self._receive()
                 if isinstance(message, m.Welcome):
                     return self._make_pilot(message)
@@ -123,7 +123,7 @@ class Service:
         if another_mission(path, welcome.run):
             raise Left(process.USAGE, f"{path} is the log of another mission: choose another --out")
         self.log = LogWriter(path, f"uav-{self.uav:03d}", config.journal, {"run": welcome.run}, resume=True)
-        observer, team = Observer(world), config.team.size
+        observer, team = ObservationBuilder(world), config.team.size
         tracks: Tracks
         radio = None
         if welcome.tracks:
@@ -133,19 +133,19 @@ class Service:
         if stalls(config, self.uav):
             tracks = StallingTracks(tracks, config, self.uav)
         self.lead = Lead() if config.trial.stall else None
-        self.witness = witness = Witness(observer) if config.trial.witness else None
-        self.oath = Oath(self.out, self.uav) if config.trial.oath else None
+        self.hasher = hasher = ObservationHasher(observer) if config.trial.observation_hash else None
+        self.ack_log = AckLog(self.out, self.uav) if config.trial.ack_log else None
 
-        def decider(model: bytes) -> Decider:
-            from actors.policy import NetworkDecider  # noqa: PLC0415  planners start without ONNX Runtime
+        def controller(model: bytes) -> Controller:
+            from actors.policy import PolicyController  # noqa: PLC0415  planners start without ONNX Runtime
 
-            network = NetworkDecider(model, config, observer)
-            return witness.watch(network) if witness else network
+            network = PolicyController(model, config, observer)
+            return hasher.watch(network) if hasher else network
 
-        who = config.team.pilot
-        planner: Decider | None = PlannerDecider(world, who) if who.startswith(PREFIX) else None
-        planner = witness.watch(planner) if witness and planner else planner
-        return Pilot(world, self.uav, self.life, tracks, observer, decider, planner, time.time_ns), radio
+        who = config.team.controller
+        planner: Controller | None = PlannerController(world, who) if who.startswith(PREFIX) else None
+        planner = hasher.watch(planner) if hasher and planner else planner
+        return Pilot(world, self.uav, self.incarnation, tracks, observer, controller, planner, time.time_ns), radio
 
     def _remind(self) -> None:
         """Ask the TMC for what the mission waits, where this UAV has not moved for some seconds, and tell."""
@@ -186,11 +186,11 @@ class Service:
         quiet = not self.sock.poll(int(patience * 1000))
         # The beacons of others are no answer: who flies, or waits for a peer, is heard all the same.
         if (quiet or self.pilot.under_way) and time.monotonic() - self._said > self._silence:
-            self._silence = min(2 * self._silence, SILENCE[1])
+            self._silence = min(2 * self._silence, RETRY_BACKOFF_S[1])
             self._repeat()
         if quiet:
             return
-        self._silence = SILENCE[0]
+        self._silence = RETRY_BACKOFF_S[0]
         while (message := self._receive()) is not None:
             answer = self._obey(message)
             if answer is not None:
@@ -204,9 +204,9 @@ class Service:
         elif pilot.phase is Phase.POLICY:
             self.say(m.PolicyRequest(pilot.wanted))
         elif pilot.under_way:
-            self.say(m.Alive(self.uav, self.life, pilot.t, self._peer, pilot.sequence))
+            self.say(m.Alive(self.uav, self.incarnation, pilot.t, self._peer, pilot.sequence))
         else:
-            self.say(m.Hello("uav", self.uav, self.life))
+            self.say(m.Hello("uav", self.uav, self.incarnation))
 
     def _obey(self, message: m.Message | None) -> m.Message | None:
         """Act on a message of the TMC or a peer; returns what to say to it."""
@@ -235,25 +235,25 @@ class Service:
     def _acknowledged(self, sequence: int) -> None:
         """The TMC has all records below this one for good."""
         for record in self.pilot.acknowledge(sequence):
-            if self.oath is not None:
-                self.oath.swear(record)
+            if self.ack_log is not None:
+                self.ack_log.append(record)
 
     def _say_again(self, sequence: int) -> None:
         """A TMC that was started again asks for what it has not, from record `sequence` on."""
         try:
-            missed = self.pilot.missed(sequence)
+            records = self.pilot.records_from(sequence)
         except LostRecordsError as lost:
             raise Left(process.FAILED, f"{lost}: its process must start anew") from None
-        for record in missed:
+        for record in records:
             self.say(record)
 
     def _on_error(self, error: m.Error) -> None:
         self._note("ERROR", f"the TMC says: {error.text}")
-        if error.code == "fenced" and error.life == self.life:
+        if error.code == "fenced" and error.incarnation == self.incarnation:
             raise Left(process.FENCED, error.text)
-        if error.code == "state" and time.monotonic() - self._asked > SILENCE[0]:
+        if error.code == "state" and time.monotonic() - self._asked > RETRY_BACKOFF_S[0]:
             self._asked = time.monotonic()  # a TMC that was started again knows less than it did
-            self.say(m.Hello("uav", self.uav, self.life))
+            self.say(m.Hello("uav", self.uav, self.incarnation))
         if error.code in {"refused", "version"}:
             raise Left(process.USAGE, f"the TMC refused: {error.text}")
 
@@ -261,15 +261,17 @@ class Service:
         """Wait for the cell of a peer: until its row of the table shows it, or its beacon wakes the socket."""
         start, self._peer = time.monotonic(), waiting.peer
         if self.table is not None:
-            self.table.wait(waiting.peer, waiting.tick, NAP * min(1 + tries, 10))
+            self.table.wait(waiting.peer, waiting.tick, PEER_POLL_S * min(1 + tries, 10))
         elif self.radio is not None:
-            self._ask_at = self._ask_at if tries else start + ASK_EVERY
+            self._ask_at = self._ask_at if tries else start + ASK_INTERVAL_S
             self.sock.poll(max(0, math.ceil(1000 * (self._ask_at - start))))
             if time.monotonic() >= self._ask_at:  # whatever else came in
-                self._ask_at += ASK_EVERY
+                self._ask_at += ASK_INTERVAL_S
                 self.radio.ask(waiting.peer)
         waited = time.monotonic() - start
-        if self.table is None or waited >= NAP or tries >= 10:  # a row may show another episode at once, for ever
+        if (
+            self.table is None or waited >= PEER_POLL_S or tries >= 10
+        ):  # a row may show another episode at once, for ever
             self._listen(0)
         self.waited += waited
 
@@ -290,14 +292,14 @@ class Service:
 
     def _report(self, record: m.Record) -> None:
         """Where the UAV is, how fast it flies and how long it waited: for whoever looks at the log."""
-        if self.log is not None and self.witness is not None:
-            self.log.write(uav_topic(self.uav, "witness"), self.witness.testify(record))
+        if self.log is not None and self.hasher is not None:
+            self.log.write(uav_topic(self.uav, "observation_hash"), self.hasher.hashes_for(record))
         pilot, (then, steps), now = self.pilot, self._reported, time.monotonic()
         due = now >= self._status_due or (self.lead is not None and record.tick == pilot.config.training.ticks)
         if self.log is None or not due:
             return
         rate = (pilot.steps - steps) / (now - then)
-        self._reported, self._status_due = (now, pilot.steps), now + STATUS_EVERY
+        self._reported, self._status_due = (now, pilot.steps), now + STATUS_INTERVAL_S
         self.log.write(uav_topic(self.uav, "status"), UavStatus(
             uav=self.uav, episode=record.episode, tick=record.tick, cell=pilot.cell, waited=self.waited,
             steps_per_second=rate, explored=pilot.explored, lead=pilot.airspace.lead(pilot.t), **self._lead_so_far(),

@@ -33,7 +33,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("verify", "deploy.commands.verify", "put to the test: exactness, asynchrony, chaos"),
     Command("bench", "deploy.commands.bench", "measure this machine: speed, start, memory, each beside a reference"),
     Command("analyze", "deploy.commands.analyze", "a run's summary and pictures, from its log"),
-    Command("log", "deploy.commands.log", "a run's logs: read, check, recover, seal, merge, replay"),
+    Command("log", "deploy.commands.log", "a run's logs: read, check, recover, compact, merge, replay"),
     Command("map", "deploy.commands.map", "the maps: list, show, export, check"),
     Command("tmc", "deploy.commands.tmc", "the TMC alone, for roles started by hand or on other hosts"),
     Command("actor", "deploy.commands.actor", "one UAV alone"),

@@ -13,7 +13,7 @@ from tmc.center.journal import journal_in
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.files import plain
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import PolicyCard, PolicyError
 from tmc.kernel.roadmap import COPY, builtin_maps
 from tmc.kernel.world import World
@@ -22,7 +22,7 @@ from tmc.wire.capacity import check_policy
 
 
 @dataclass(frozen=True)
-class Who:
+class PolicySpec:
     """A pilot by name, with the policy file's bytes unless it is a planner, and the settings that it brings along."""
 
     name: str
@@ -30,12 +30,12 @@ class Who:
     values: dict[str, Any]
 
 
-def resolve(name: str) -> Who:
+def resolve(name: str) -> PolicySpec:
     """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy."""
     if name.startswith(PREFIX):
         if name.removeprefix(PREFIX) not in PLANNERS:
             raise ConfigError(f"there is no planner '{name}': choose {', '.join(PREFIX + p for p in PLANNERS)}")
-        return Who(name, None, {"team.pilot": name})
+        return PolicySpec(name, None, {"team.controller": name})
     try:
         is_folder = stat.S_ISDIR(Path(name).stat().st_mode)
     except (OSError, ValueError):  # nothing of that name, or a name that nothing can have
@@ -47,7 +47,7 @@ def resolve(name: str) -> Who:
     return _of_file(name, Path(name), {})
 
 
-def _of_run(folder: Path) -> Who:
+def _of_run(folder: Path) -> PolicySpec:
     """The final policy of a run, in the mission that it was trained for."""
     journal, policy = journal_in(folder), folder / "policies" / "final.onnx"
     if journal is None and not (folder / "config.json").exists():
@@ -56,8 +56,8 @@ def _of_run(folder: Path) -> Who:
     for note in settings.notes:
         process.tell(f"{folder}: {note}")
     values = dict(flat(settings.config)) | _map_of(folder, settings.config)
-    if values["team.pilot"] != "policy":
-        return Who(str(folder), None, values)
+    if values["team.controller"] != "policy":
+        return PolicySpec(str(folder), None, values)
     if not policy.exists():
         policy = folder / "policies" / "flown.onnx"
     if not policy.exists():
@@ -71,7 +71,7 @@ def _map_of(folder: Path, config: Config) -> dict[str, Any]:
     return {"world.map": str(copy)} if config.world.map not in builtin_maps() and copy.exists() else {}
 
 
-def _of_file(name: str, path: Path, values: dict[str, Any]) -> Who:
+def _of_file(name: str, path: Path, values: dict[str, Any]) -> PolicySpec:
     from actors.policy import read_card  # noqa: PLC0415  ONNX Runtime only where a policy flies
 
     try:
@@ -83,7 +83,7 @@ def _of_file(name: str, path: Path, values: dict[str, Any]) -> Who:
     except OSError as error:
         mend = "give a policy file, a run folder or a planner"
         raise PolicyError(f"{plain(path)} cannot be read ({error.strerror}): {mend}") from None
-    return Who(name, model, values | view_of(card) | {"team.pilot": "policy"})
+    return PolicySpec(name, model, values | view_of(card) | {"team.controller": "policy"})
 
 
 def view_of(card: PolicyCard) -> dict[str, Any]:
@@ -96,9 +96,9 @@ def view_of(card: PolicyCard) -> dict[str, Any]:
     }
 
 
-def pilot_of(who: Who) -> dict[str, Any]:
+def pilot_of(who: PolicySpec) -> dict[str, Any]:
     """The one setting that WHO decides, whatever else is set."""
-    return {"team.pilot": who.values["team.pilot"]}
+    return {"team.controller": who.values["team.controller"]}
 
 
 FIXED = {"exploration.start": 0.0, "exploration.end": 0.0}
@@ -107,15 +107,15 @@ FIXED = {"exploration.start": 0.0, "exploration.end": 0.0}
 
 def require_policy(model: bytes, world: World, name: str) -> None:
     """Raise PolicyError, which names the policy, unless it can fly in this world, as far as can be seen before."""
-    from actors.policy import NetworkDecider  # noqa: PLC0415  as above
+    from actors.policy import PolicyController  # noqa: PLC0415  as above
 
     try:
         check_policy(len(model))
-        NetworkDecider(model, world.config, Observer(world))
+        PolicyController(model, world.config, ObservationBuilder(world))
     except PolicyError as error:
         raise PolicyError(f"{plain(name)}: {error}") from None
 
 
 def is_planner(config: Config) -> bool:
     """True when a planner flies, and no policy."""
-    return config.team.pilot.startswith(PREFIX)
+    return config.team.controller.startswith(PREFIX)

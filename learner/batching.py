@@ -12,7 +12,7 @@ from torch import Tensor
 
 from learner.qnet import Shape
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Floats, Ints, Observer, Views
+from tmc.kernel.observation import Floats, Ints, ObservationBuilder, Views
 from tmc.wire.messages import Minibatch
 
 
@@ -38,16 +38,16 @@ class Batch:
     weight: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
 
 
-class Intake:
+class BatchBuilder:
     """Draws the observations of minibatches, into the same memory each time and as the convolutions like them."""
 
-    def __init__(self, observer: Observer) -> None:
+    def __init__(self, observer: ObservationBuilder) -> None:
         self.observer = observer
         channels, height, width = observer.shape
         self._sides, self._channels = (height, width), channels
         self._now = self._next = np.empty((0, *observer.shape), np.float32)
 
-    def read(self, minibatch: Minibatch) -> Batch:
+    def build(self, minibatch: Minibatch) -> Batch:
         """The batch; the one before must not be used any more. Raises TrainingError for what cannot be drawn."""
         views, b = self._views(minibatch), len(minibatch.action)
         if len(self._now) != b:
@@ -76,7 +76,7 @@ class Intake:
         return Views(m.cells, m.peers, m.u)
 
 
-def laid_out(images: Floats) -> Tensor:
+def as_channels_last(images: Floats) -> Tensor:
     """(B, C, H, W) float32, channels last; the same memory where it lies so already."""
     return torch.from_numpy(images).contiguous(memory_format=torch.channels_last)
 

@@ -55,7 +55,8 @@ def td_error(q: Tensor, action: Tensor, y: Tensor) -> Tensor:
 def loss(td: Tensor, kind: Literal["mse", "huber"] = "mse", weight: Tensor | None = None) -> Tensor:
     """Eq. (9): the mean squared error over the minibatch; or (ours) Huber: td^2 / 2, linear beyond |td| = 1.
 
-    `weight` (B,): what each transition counts (ours, `replay.priority`); the paper has none, and so all count alike.
+    `weight` (B,): what each transition counts (ours, `replay.priority_exponent`); the paper has none, and so all count
+    alike.
     """
     if weight is not None:
         each = huber_loss(td, torch.zeros_like(td), reduction="none") if kind == "huber" else td.square()

@@ -1,4 +1,4 @@
-"""The bare compute loop: the update of Algorithm 1 as anybody would write it in torch, and nothing around it.
+"""The textbook loop: the update of Algorithm 1 as anybody would write it in torch, and nothing around it.
 
 `overfly bench learner` compares the learner with it, in speed and in results: contiguous tensors, eager mode, torch's
 default Adam, everything computed every time. `python -m learner.reference` runs it on one minibatch that
@@ -32,7 +32,7 @@ WARM = 10
 """Updates before time is taken."""
 
 
-class Bare:
+class ReferenceLearner:
     """theta, theta- and Adam, from the initial weights of the settings; theta- follows as the trainer's does."""
 
     def __init__(self, config: Config, shape: qnet.Shape) -> None:
@@ -80,7 +80,7 @@ class Tensors:
 
 def resident(config: Config, shape: qnet.Shape) -> Batch:
     """A minibatch of noise, for timing: what is in it does not change what is computed."""
-    rng, b = np.random.Generator(np.random.Philox(1)), config.dqn.batch
+    rng, b = np.random.Generator(np.random.Philox(1)), config.dqn.batch_size
     o, o_next = (rng.random((b, *shape), np.float32) for _ in range(2))
     action, reward = rng.integers(0, N_ACTIONS, b).astype("u1"), rng.random(b, np.float32)
     discount, allowed = np.full(b, config.dqn.gamma, "<f4"), np.ones((b, N_ACTIONS), "u1")
@@ -88,10 +88,10 @@ def resident(config: Config, shape: qnet.Shape) -> Batch:
 
 
 def rate(config: Config, seconds: float) -> float:
-    """Updates a second of the bare loop, on as many threads as the settings say."""
+    """Updates a second of the textbook loop, on as many threads as the settings say."""
     torch.set_num_threads(config.training.threads)
     shape = view_shape(config, World(config).grid)
-    bare, batch = Bare(config, shape), Tensors(resident(config, shape))
+    bare, batch = ReferenceLearner(config, shape), Tensors(resident(config, shape))
     for _ in range(WARM):
         bare.update(batch)
     start = time.perf_counter()
@@ -104,7 +104,7 @@ def rate(config: Config, seconds: float) -> float:
 class Departures:
     """How far gradients of float32 are from the exact ones: the largest of all updates.
 
-    `learner`, `textbook`: the trainer's and the bare loop's, relative to the gradient's length. `of_bound`: the
+    `learner`, `textbook`: the trainer's and the textbook loop's, relative to the gradient's length. `of_bound`: the
     trainer's, in any one weight, relative to the most that rounding can do there (`learner.rounding`). Above 1, the
     trainer computes something else.
     """
@@ -115,15 +115,15 @@ class Departures:
 
 
 def departures(config: Config, batches: Iterable[Batch]) -> Departures:
-    """Compare the trainer's gradient of each update with the exact one, and the bare loop's with that too.
+    """Compare the trainer's gradient of each update with the exact one, and the textbook loop's with that too.
 
-    Before each update the bare loop gets the trainer's theta, and the exact gradient is taken there; theta- follows by
-    itself. Left alone, two loops drift apart by rounding that every step enlarges, and a mistake would hide in that.
+    Before each update the textbook loop gets the trainer's theta, and the exact gradient is taken there; theta- follows
+    by itself. Left alone, two loops drift apart by rounding that every step enlarges, and a mistake would hide in that.
     """
     torch.set_num_threads(1)  # as `trainer.start` does
     grid = World(config).grid
     shape = view_shape(config, grid)
-    trainer, bare = Trainer(config, shape, grid), Bare(config, shape)
+    trainer, bare = Trainer(config, shape, grid), ReferenceLearner(config, shape)
     found = [torch.zeros(3, dtype=torch.float64)]
     for batch in batches:
         bare.online.load_state_dict(trainer.online.state_dict())

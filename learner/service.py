@@ -12,12 +12,12 @@ from typing import Any
 import zmq
 
 from learner import checkpoint
-from learner.batching import Intake
+from learner.batching import BatchBuilder
 from learner.checkpoint import CheckpointError, Saved
 from learner.trainer import UpdateMetrics, start
 from tmc.kernel import files
 from tmc.kernel.config import build
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
 from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
@@ -28,9 +28,9 @@ from tmc.wire.sockets import EndpointError
 
 WINDOW = 2
 """Minibatch requests in flight, so that the learner never waits for the way there and back."""
-SILENCE = 1.0
+HELLO_INTERVAL_S = 1.0
 """Seconds without a minibatch after which the learner says hello again: the TMC may have been started anew."""
-METRICS_EVERY = 0.2
+METRICS_INTERVAL_S = 0.2
 """Seconds between two metrics messages in the log."""
 
 
@@ -43,9 +43,9 @@ class Service:
 
     def __init__(self, endpoint: str, out: Path) -> None:
         self.endpoint, self.out = endpoint, out
-        self.life = int.from_bytes(os.urandom(7), "big")
+        self.incarnation = int.from_bytes(os.urandom(7), "big")
         self.context: zmq.Context[Any] = zmq.Context()
-        self.sock = sockets.dealer(self.context, sockets.feed_endpoint(endpoint), "learner")
+        self.sock = sockets.dealer(self.context, sockets.learner_endpoint(endpoint), "learner")
         self.log: LogWriter | None = None
         self.reminder = process.Reminder()
         self._request, self._flying = 0, set[int]()
@@ -63,7 +63,7 @@ class Service:
         folder, skipped = self.out / "checkpoints", list[str]()
         saved = checkpoint.newest(folder, skipped.append)
         if skipped and saved is None:
-            raise CheckpointError(f"no checkpoint in {folder} is sound: remove them all to begin with new weights")
+            raise CheckpointError(f"no checkpoint in {folder} is intact: remove them all to begin with new weights")
         welcome = self._join(saved, stop)
         if not isinstance(welcome, m.Welcome):
             return welcome is not None
@@ -84,8 +84,10 @@ class Service:
         """Say hello until the TMC answers; None when stopped before."""
         while not stop():
             if self.reminder.due():
-                process.note(f"the learner waits for a TMC at {sockets.waiting(sockets.feed_endpoint(self.endpoint))}")
-            sockets.send(self.sock, m.Hello("learner", -1, self.life, saved.meta.updates if saved else 0))
+                process.note(
+                    f"the learner waits for a TMC at {sockets.waiting(sockets.learner_endpoint(self.endpoint))}"
+                )
+            sockets.send(self.sock, m.Hello("learner", -1, self.incarnation, saved.meta.updates if saved else 0))
             if self.sock.poll(1000):
                 message = self._receive()
                 if isinstance(message, m.Welcome | m.End):
@@ -103,7 +105,7 @@ class Service:
         self._own(welcome.run)
         self._run = welcome.run
         self.config = config
-        self.trainer, self.intake = start(config, world.grid), Intake(Observer(world))
+        self.trainer, self.builder = start(config, world.grid), BatchBuilder(ObservationBuilder(world))
         self.out.mkdir(parents=True, exist_ok=True)
         self.log = LogWriter(self.out / "learner.mcap", "learner", config.journal, {"run": welcome.run}, resume=True)
         if saved is not None:
@@ -124,8 +126,8 @@ class Service:
     def _listen(self) -> list[m.Message]:
         """What has come in; the time spent waiting for it is the learner's idle time."""
         since = time.monotonic()
-        if not self.sock.poll(int(SILENCE * 1000)):
-            sockets.send(self.sock, m.Hello("learner", -1, self.life, self.trainer.updates))
+        if not self.sock.poll(int(HELLO_INTERVAL_S * 1000)):
+            sockets.send(self.sock, m.Hello("learner", -1, self.incarnation, self.trainer.updates))
             self._hailed = True
         self._idle += time.monotonic() - since
         message = self._receive()
@@ -175,7 +177,7 @@ class Service:
             self._on_status(message)
         elif isinstance(message, m.Error):
             self._say("error", f"the TMC says: {message.text}")
-            if message.code == "fenced" and message.life == self.life:
+            if message.code == "fenced" and message.incarnation == self.incarnation:
                 raise ReplacedError(message.text)
         return isinstance(message, m.End)
 
@@ -184,12 +186,12 @@ class Service:
         while len(self._flying) < WINDOW:
             self._request += 1
             self._flying.add(self._request)
-            sockets.send(self.sock, m.SampleRequest(self._request, *self.trainer.judged(), self.life))
+            sockets.send(self.sock, m.SampleRequest(self._request, *self.trainer.take_td_errors(), self.incarnation))
 
     def _update(self, minibatch: m.Minibatch) -> None:
-        metrics = self.trainer.update(self.intake.read(minibatch))
+        metrics = self.trainer.update(self.builder.build(minibatch))
         self._loss = metrics.loss
-        if metrics.updates % self.config.training.push_every == 0:
+        if metrics.updates % self.config.training.publish_every == 0:
             self._push()
         if metrics.updates % self.config.training.checkpoint_every == 0:
             checkpoint.save(self.out / "checkpoints", self.trainer)
@@ -197,7 +199,7 @@ class Service:
 
     def _push(self) -> bytes:
         version, model = self.trainer.policy()
-        push = m.PolicyPush(version, self.trainer.updates, self._loss, model, time.time_ns(), self.life)
+        push = m.PolicyPush(version, self.trainer.updates, self._loss, model, time.time_ns(), self.incarnation)
         sockets.send(self.sock, push)
         return model
 
@@ -220,7 +222,7 @@ class Service:
             idle_share=min(self._idle / span, 1.0), wall=now - self._start,
         ))  # fmt: skip
         self._told, self._told_updates, self._idle = now, metrics.updates, 0.0
-        self._metrics_due = now + METRICS_EVERY
+        self._metrics_due = now + METRICS_INTERVAL_S
 
     def _finish(self) -> None:
         """The last metrics, the last checkpoint, the last policy, and its file."""

@@ -16,7 +16,7 @@ LARGEST = 2**20
 """Values kept at most, 12 bytes each: a larger memory of transitions than that is drawn from less often."""
 
 
-class Known:
+class TargetValueCache:
     """One value a transition, by the number that a minibatch gives it. Transition n has place n mod `size`.
 
     The TMC's numbers grow with the mission, so the newest `size` of them have a place each; of two that share one, the

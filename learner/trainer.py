@@ -15,18 +15,18 @@ from torch import Tensor
 
 from learner import dqn, qnet
 from learner.adam import Adam
-from learner.batching import Batch, TrainingError, check, laid_out
+from learner.batching import Batch, TrainingError, as_channels_last, check
 from learner.export import to_onnx
 from learner.gradient import Gradient
 from learner.qnet import QNet, Shape
-from learner.target_cache import Known
+from learner.target_cache import TargetValueCache
 from tmc.kernel.config import Config
 from tmc.kernel.grid import Grid
 from tmc.kernel.observation import Floats, Ints
 from tmc.kernel.policy import card_for, view_shape
 
-NOTHING = np.zeros(0, np.int64), np.zeros(0, np.float32)
-HUGE = 1e30
+NO_ERRORS = np.zeros(0, np.int64), np.zeros(0, np.float32)
+MAX_LOSS = 1e30
 """No loss and no value of Q is that large, unless the training diverges."""
 
 
@@ -72,20 +72,20 @@ class Trainer:
         self.target = copy.deepcopy(self.online).requires_grad_(False)
         self.adam = Adam(self.online.parameters(), config.dqn.learning_rate)
         self._gradient = Gradient(self.online, config)
-        self._known = Known(config.replay.capacity)
-        self._judged = NOTHING
+        self._known = TargetValueCache(config.replay.capacity)
+        self._judged = NO_ERRORS
 
     def update(self, batch: Batch) -> UpdateMetrics:
         """One step of Adam on eq. (9), and theta- = theta when that is due. Raises TrainingError."""
         check(batch, self.shape)
         self._follow(batch.episodes)
         values, rest = self._known_values(batch)
-        o, action = laid_out(batch.observation), torch.tensor(batch.action, dtype=torch.int64)
+        o, action = as_channels_last(batch.observation), torch.tensor(batch.action, dtype=torch.int64)
         weight = torch.tensor(batch.weight) if batch.weight.size else None
         passes = rest.size * (2 if self.config.dqn.double else 1)
         gradient, q, y, loss = self._gradient(o, action, lambda: self._target(batch, values, rest), weight, passes)
         metrics = self._step(gradient, q, loss, y)
-        if self.config.replay.priority:
+        if self.config.replay.priority_exponent:
             self._judged = batch.index, (q - y).abs().numpy()
         every = self.config.dqn.target_updates
         if every and self.updates % every == 0:
@@ -101,7 +101,7 @@ class Trainer:
     def _target(self, batch: Batch, values: Floats, rest: Ints) -> Tensor:
         """y of eq. (8), of scaled rewards, as `dqn.target`; `values` (B,) are those of o', but for the rows `rest`."""
         if rest.size:
-            o_next, allowed = laid_out(batch.next_observation(rest)), torch.tensor(batch.allowed[rest])
+            o_next, allowed = as_channels_last(batch.next_observation(rest)), torch.tensor(batch.allowed[rest])
             choice = self.online(o_next) if self.config.dqn.double else None
             values[rest] = dqn.value(self.target(o_next), allowed, choice).numpy()
             if choice is None:  # a value that theta has chosen changes with every update
@@ -109,18 +109,18 @@ class Trainer:
         reward = torch.tensor(batch.reward) * self.config.dqn.reward_scale
         return dqn.bootstrap(reward, torch.tensor(batch.discount), torch.from_numpy(values))
 
-    def judged(self) -> tuple[NDArray[np.int64], Floats]:
+    def take_td_errors(self) -> tuple[NDArray[np.int64], Floats]:
         """The transitions of the last update, by number, and |Q - y| of each; told once. Shapes (B,), or empty.
 
-        Their new priorities (Schaul et al. 2016, Algorithm 1): nothing where `replay.priority` is 0.
+        Their new priorities (Schaul et al. 2016, Algorithm 1): nothing where `replay.priority_exponent` is 0.
         """
-        judged, self._judged = self._judged, NOTHING
+        judged, self._judged = self._judged, NO_ERRORS
         return judged
 
     def forget(self) -> None:
         """The numbers of transitions begin anew: what was known of them is of others."""
         self._known.forget()
-        self._judged = NOTHING
+        self._judged = NO_ERRORS
 
     def _step(self, gradient: list[Tensor], q: Tensor, loss: Tensor, y: Tensor) -> UpdateMetrics:
         """A step of Adam down the gradient of `loss`; `q` (B,) = Q(o, a; theta), `y` (B,)."""
@@ -128,7 +128,7 @@ class Trainer:
             p.grad = g
         means = (loss, q.mean(), y.mean(), (q - y).abs().mean(), torch.linalg.vector_norm(flat(gradient)))
         values = torch.stack(means).tolist()
-        if not all(abs(value) < HUGE for value in values):  # which is not so for NaN either
+        if not all(abs(value) < MAX_LOSS for value in values):  # which is not so for NaN either
             raise TrainingError(
                 f"update {self.updates + 1} diverged (loss {values[0]:g}): lower dqn.learning_rate or dqn.reward_scale"
             )

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from deploy.cli import main
 
-PATIENCE = 150.0
+PATIENCE_S = 150.0
 """Seconds after which a test stops waiting. What comes ends the wait at once, so only what never comes takes so long;
 on a machine that does other work as well, all takes several times as long as on a quiet one."""
 LINE = (sys.executable, "-P", "-m", "deploy.cli")
 """How `overfly` is started, whatever lies in the folder that it is started in."""
 
 
-def overfly(*args: object, cwd: Path, timeout: float = PATIENCE) -> subprocess.CompletedProcess[str]:
+def overfly(*args: object, cwd: Path, timeout: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
     """`overfly ARGS` in a process of its own."""
     line = [*LINE, *map(str, args)]
     return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)

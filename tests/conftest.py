@@ -27,7 +27,8 @@ for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "PYTHONWARNINGS"):
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 TRAINED = ("run", "quick", "--ticks", 60, "--episodes", 2, "--no-pictures",
-           *(word for change in ("replay.learn_start=60", "dqn.batch=16", "journal.flush=0.1", "trial.witness=true")
+           *(word for change in ("replay.learn_start=60", "dqn.batch_size=16", "journal.flush_interval=0.1",
+                                 "trial.observation_hash=true")
              for word in ("--set", change)))  # fmt: skip
 
 

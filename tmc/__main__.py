@@ -35,7 +35,7 @@ def serve(config: Config, endpoint: str, out: Path, *, policy: Path | None, trac
     stop = process.Stop()
     world = world_of_run(config, out)
     run = (run_of(out, config) if resume else None) or uuid.uuid4().hex[:12]
-    learning = policy is None and config.team.pilot == "policy"
+    learning = policy is None and config.team.controller == "policy"
     capacity.check(world, learning=learning)
     model = files.read_bytes(policy) if policy else None
     station = Station(world, run, learning=learning, policy=model, tracks=tracks)
@@ -63,15 +63,15 @@ def run_of(out: Path, config: Config) -> str | None:
 
 
 def take_up(station: Station, journal: Journal) -> None:
-    """Play the journal that an earlier life left, and write what is missing in it."""
+    """Play the journal that an earlier incarnation left, and write what is missing in it."""
     start = time.monotonic()
     missing = recover(station, journal.writer.active, start)
     for member in station.roster:
         member.heard = time.monotonic()  # nobody could be heard while the journal was played
     journal.take(Outbox(entries=missing))
     journal.commit()
-    seconds, flight = time.monotonic() - start, station.flight
-    where = f"tick {flight.done} of episode {flight.episode}" if flight else f"the end of episode {station.episodes}"
+    seconds, episode = time.monotonic() - start, station.episode
+    where = f"tick {episode.done} of episode {episode.number}" if episode else f"the end of episode {station.episodes}"
     journal.writer.log("warning", f"the TMC was started again and goes on from {where}; recovery took {seconds:.2f} s")
 
 

@@ -1,5 +1,5 @@
-"""`overfly bench actor`: whole steps of a UAV (sense, observe, decide, move, reward, record) against the bare call of
-ONNX Runtime on one image, in one process on one thread, in turns.
+"""`overfly bench actor`: whole steps of a UAV (sense, observe, decide, move, reward, record) against the textbook call
+of ONNX Runtime on one image, in one process on one thread, in turns.
 
 A pilot flies the network of the settings, with its first weights, in a team; the TMC's part is not
 timed. Times are the processor's.
@@ -22,7 +22,7 @@ from deploy.bench.row import Row
 from deploy.run.mission import check
 from tmc.center.roster import uav_name
 from tmc.center.station import Station
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import INPUT, OUTPUT
 from tmc.kernel.world import World
 from tmc.wire import messages as m
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Fly episodes, with as many bare calls after each stretch as it had steps."""
+    """Fly episodes, with as many textbook calls after each stretch as it had steps."""
     bounds.number("--repeats", args.repeats, 1)
     values = {**policy_spec.FIXED, "training.episodes": args.repeats, **settings.chosen(args)}
     world = check(settings.config_for("paper", values))
@@ -50,7 +50,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
     case = f"N={world.config.team.size}"
     return [
         Row("actor", f"{case} a whole step", 1e6 * steps, "us", 1e6 * calls, share, "the call of ONNX Runtime / step"),
-        Row("actor", f"{case} steps", 1 / steps, "UAV steps/s", 1 / calls, share, f"x bare calls/s, aim {AIM:g}"),
+        Row("actor", f"{case} steps", 1 / steps, "UAV steps/s", 1 / calls, share, f"x textbook calls/s, aim {AIM:g}"),
     ]
 
 
@@ -65,16 +65,16 @@ class Team:
     """Pilots in one process, in lock step, and a TMC whose time is not theirs."""
 
     def __init__(self, world: World, policy: bytes) -> None:
-        from actors.policy import NetworkDecider, open_model  # noqa: PLC0415  ONNX Runtime only for those who measure this
+        from actors.policy import PolicyController, open_model  # noqa: PLC0415  ONNX Runtime only for those who measure this
 
-        config, observer = world.config, Observer(world)
+        config, observer = world.config, ObservationBuilder(world)
         self.station = Station(world, "bench", policy=policy, learning=False)
-        self.decider = NetworkDecider(policy, config, observer)
+        self.controller = PolicyController(policy, config, observer)
         self._session, self._image = open_model(policy)[0], np.zeros((1, *observer.shape), np.float32)
         table = TrackTable(config.team.size, config.training.ticks)
         team = range(config.team.size)
         tracks = [TableTracks(table, i) for i in team]
-        pilots = [Pilot(world, i, 1, tracks[i], observer, lambda _: self.decider) for i in team]
+        pilots = [Pilot(world, i, 1, tracks[i], observer, lambda _: self.controller) for i in team]
         self.fleet, self._elsewhere = Fleet(pilots, self._exchange), 0.0
         for i in team:
             for j, answer in self._exchange(i, m.Hello("uav", i, 1)):
@@ -89,16 +89,16 @@ class Team:
         return [(int(to.removeprefix("uav-")), answer) for to, answer in sends if to.startswith("uav-")]
 
     def fly(self, episode: int) -> tuple[float, float]:
-        """Seconds a whole step, and seconds a bare call, in the rest of an episode."""
-        spent = bare = 0.0
+        """Seconds a whole step, and seconds a textbook call, in the rest of an episode."""
+        spent = textbook = 0.0
         before = flown = self._steps()
-        while self.station.flight is not None and self.station.flight.episode == episode:
+        while self.station.episode is not None and self.station.episode.number == episode:
             since, elsewhere = time.process_time(), self._elsewhere
             self.fleet.step()
             spent += time.process_time() - since - (self._elsewhere - elsewhere)
             steps, flown = self._steps() - flown, self._steps()
-            bare += self._calls(steps)
-        return spent / (flown - before), bare / (flown - before)
+            textbook += self._calls(steps)
+        return spent / (flown - before), textbook / (flown - before)
 
     def _steps(self) -> int:
         return sum(pilot.steps for pilot in self.fleet.pilots)

@@ -26,7 +26,7 @@ from tmc.center.journal import Journal
 from tmc.center.roster import Outbox
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.world import World
-from tmc.record.mcap.compact import seal_log
+from tmc.record.mcap.compact import compact_log
 from tmc.record.reader import Log, run_files
 from tmc.record.writer import LogWriter
 from tmc.wire import process
@@ -90,7 +90,7 @@ def steps_of(config: Config) -> int:
 
 
 def records_in(outbox: Outbox) -> int:
-    """Flight records among the entries."""
+    """EpisodeState records among the entries."""
     return sum("record" in entry.values for entry in outbox.entries)
 
 
@@ -172,7 +172,7 @@ def fsyncs(world: World, outboxes: list[Outbox], folder: Path) -> list[float]:
     try:
         for outbox, _ in zip(cycle(outboxes), range(SYNCS), strict=False):
             journal.take(outbox)
-            time.sleep(world.config.journal.commit)
+            time.sleep(world.config.journal.commit_interval)
             journal.commit()
             begin = time.perf_counter()
             os.fsync(number)
@@ -202,9 +202,9 @@ def _sizes(world: World, flown: Path, folder: Path) -> Iterator[Row]:
     alone = records_alone(world.config, flown, folder)
     steps = steps_of(world.config)
     for case, files in (("all topics of all files", [*run_files(flown).values()]), ("flight records alone", [alone])):
-        sealed = [seal_log(file) for file in files]
-        before, after = (sum(getattr(s, name) for s in sealed) / steps for name in ("before", "after"))
-        yield Row("journal", f"{case}, sealed", after, "bytes/UAV step", before, after / before, "x as written")
+        compacted = [compact_log(file) for file in files]
+        before, after = (sum(getattr(s, name) for s in compacted) / steps for name in ("before", "after"))
+        yield Row("journal", f"{case}, compacted", after, "bytes/UAV step", before, after / before, "x as written")
     begin = time.perf_counter()
     result = check_log(flown)
     seconds = time.perf_counter() - begin
@@ -222,7 +222,7 @@ def records_alone(config: Config, flown: Path, folder: Path) -> Path:
             if raw.schema == "overfly.FlightRecord":
                 if raw.log_time >= due:
                     log.flush()
-                    due = raw.log_time + round(1e9 * config.journal.commit)
+                    due = raw.log_time + round(1e9 * config.journal.commit_interval)
                 log.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
     return path
 

@@ -1,4 +1,4 @@
-"""`overfly bench learner`: the learner of a running mission against the bare compute loop, in speed and in results.
+"""`overfly bench learner`: the learner of a running mission against the textbook compute loop, in speed and in results.
 
 The mission is the paper's with a memory of 1,500 transitions and a target that follows every 75 updates: each
 transition is drawn 6.4 times before theta- changes and 15 % of them are new then, as with the paper's 100,000 and
@@ -25,7 +25,7 @@ from deploy.bench.rollout import started, weigh_all
 from deploy.bench.row import Row
 from deploy.run import helper, plan
 from deploy.run.mission import check
-from deploy.run.progress import Observer
+from deploy.run.progress import StatusPoller
 from deploy.run.supervisor import Supervisor
 from tmc.center.replay import Replay
 from tmc.kernel import observation
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 SCALED = {"replay.capacity": 1500, "dqn.target_episodes": 0, "dqn.target_updates": 75}
 MISSION = {**SCALED, "training.episodes": 1_000_000}
 """It is stopped, not finished."""
-POLL = 0.05
+POLL_S = 0.05
 """Seconds between two looks at the processes."""
 TUNED = "in the learner's environment"
 """Memory is kept and idle threads sleep, as in the learner; what that alone is worth shows."""
@@ -73,28 +73,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Bare loop and mission in turns, then the comparison of results; one row a figure."""
+    """ReferenceLearner loop and mission in turns, then the comparison of results; one row a figure."""
     bounds.stretches(args.repeats, args.seconds, 3)
     bounds.number("--steps", args.steps, 0, 1e-3)
     values = {**MISSION, "training.threads": args.threads, **settings.chosen(args)}
     world = check(settings.config_for("paper", values))
     bounds.training(world, warm_up(world.config))
-    bare: list[float] = []
+    textbook: list[float] = []
     tuned: list[float] = []
     flown: list[Learned] = []
     with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:
         for _ in range(args.repeats):
-            bare.append(bare_loop(world.config, args.seconds, "bare"))
+            textbook.append(reference_loop(world.config, args.seconds, "textbook"))
             flown.append(fly(world, args.seconds, Path(tempfile.mkdtemp(dir=scratch))))
-            tuned.append(bare_loop(world.config, args.seconds, "learner"))
-            say(f"bare loop {bare[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s")
-    rows = list(_rows(world.config, flown, bare, tuned))
+            tuned.append(reference_loop(world.config, args.seconds, "learner"))
+            say(f"textbook loop {textbook[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s")
+    rows = list(_rows(world.config, flown, textbook, tuned))
     return rows + (list(compare(world, args.steps)) if args.steps else [])
 
 
-def _rows(config: Config, flown: list[Learned], bare: list[float], tuned: list[float]) -> Iterator[Row]:
+def _rows(config: Config, flown: list[Learned], textbook: list[float], tuned: list[float]) -> Iterator[Row]:
     case, rates = f"N={config.team.size} threads={config.training.threads}", [f.rate for f in flown]
-    for name, reference in (("bare loop", bare), (f"bare loop {TUNED}", tuned)):
+    for name, reference in (("textbook loop", textbook), (f"textbook loop {TUNED}", tuned)):
         ratio = median(a / b for a, b in zip(rates, reference, strict=True))
         yield Row("learner", f"{case}", median(rates), "updates/s", median(reference), ratio, f"x {name}")
     yield from shares("learner", case, flown)
@@ -113,7 +113,7 @@ def say(text: str) -> None:
     process.tell(text, prefix="")
 
 
-def bare_loop(config: Config, seconds: float, name: str) -> float:
+def reference_loop(config: Config, seconds: float, name: str) -> float:
     """Updates a second of `learner.reference` in a process of its own, with the environment of process `name`."""
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         file.write(json.dumps(flat(config)))
@@ -148,7 +148,7 @@ def warm_up(config: Config) -> int:
 
 
 def _wait(
-    supervisor: Supervisor, observer: Observer, updates: int = 0, until: float = 0.0
+    supervisor: Supervisor, observer: StatusPoller, updates: int = 0, until: float = 0.0
 ) -> tuple[float, messages.Status]:
     """(seconds of the clock, status) when there have been `updates`, and the clock is past `until`."""
     pace = bounds.Pace("the updates that come before:", updates)
@@ -160,7 +160,7 @@ def _wait(
             return now, status
         if status is not None and updates > 1:
             pace.check(status.updates)
-        time.sleep(POLL)
+        time.sleep(POLL_S)
 
 
 def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
@@ -182,29 +182,29 @@ def _idle(out: Path, seconds: float) -> float | None:
 
 
 def compare(world: World, steps: int) -> Iterator[Row]:
-    """The gradient of each of so many updates against the bare loop's, from minibatches of random flights."""
+    """The gradient of each of so many updates against the textbook loop's, from minibatches of random flights."""
     from learner import reference  # noqa: PLC0415  torch only for those who measure this
 
-    replay = Replay(world, observation.Observer(world))
+    replay = Replay(world, observation.ObservationBuilder(world))
     fill(replay)
     found, case = reference.departures(world.config, _batches(replay, steps)), f"{steps:,} steps"
     ratio = found.learner / found.textbook if found.textbook else None
-    yield Row("learner", case, found.learner, "of the gradient", found.textbook, ratio, "x bare loop's rounding")
+    yield Row("learner", case, found.learner, "of the gradient", found.textbook, ratio, "x textbook loop's rounding")
     yield Row(
         "learner", f"{case}, worst weight", found.of_bound, "of the bound", 1.0, found.of_bound, "x float32's bound"
     )
 
 
 def _batches(replay: Replay, count: int) -> Iterator[Batch]:
-    from learner.batching import Intake  # noqa: PLC0415
+    from learner.batching import BatchBuilder  # noqa: PLC0415
 
-    intake, pace = Intake(replay.observer), bounds.Pace("--steps", count)
+    builder, pace = BatchBuilder(replay.observer), bounds.Pace("--steps", count)
     for number in range(count):
         pace.check(number)
         if number % 200 == 199:
             say(f"{number + 1:,} of {count:,} steps compared")
-        s = replay.sample(number, replay.world.config.dqn.batch)
+        s = replay.sample(number, replay.world.config.dqn.batch_size)
         v = s.views
-        yield intake.read(
+        yield builder.build(
             Minibatch(number, 0, 0, v.cells, v.peers, v.u, s.action, s.reward, s.discount, s.allowed, s.index)
         )

@@ -17,7 +17,7 @@ from deploy.bench.row import Row
 from deploy.run.mission import check
 from tmc.center.replay import Replay
 from tmc.kernel.config import ConfigError
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.wire import process
 
@@ -40,7 +40,10 @@ def measure(args: argparse.Namespace) -> list[Row]:
     world = check(settings.config_for("paper", values))
     config = world.config
     bounds.training(world, 1)
-    least, most = max(config.replay.learn_start, config.dqn.batch), config.training.episodes * config.training.ticks
+    least, most = (
+        max(config.replay.learn_start, config.dqn.batch_size),
+        config.training.episodes * config.training.ticks,
+    )
     if not least < args.transitions < most * config.team.size:
         raise ConfigError(
             f"--transitions must be more than the {least:,} before the first update, and come to be flown"
@@ -60,7 +63,7 @@ def in_training(world: World, transitions: int, out: Path) -> rollout.Memory | N
     with rollout.started(world.config, None, out) as (supervisor, observer):
         told, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
         while not supervisor.watch():
-            time.sleep(rollout.POLL)
+            time.sleep(rollout.POLL_S)
             status = observer.ask()
             if status is None:
                 continue
@@ -84,7 +87,7 @@ def _rows(size: int, memory: rollout.Memory | None) -> Iterator[Row]:
 def full_replay(world: World) -> Row:
     """By how much this process grows when it fills a replay memory."""
     before = rollout.own()
-    memory = Replay(world, Observer(world))
+    memory = Replay(world, ObservationBuilder(world))
     replay.fill(memory)
     after, limit = rollout.own(), replay.LIMITS["memory"]
     grown = None if before is None or after is None else (after - before) * MB

@@ -30,7 +30,7 @@ from deploy.run.mission import check
 from tmc.center.replay import Replay, Ring
 from tmc.kernel.config import build, flat
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Floats, Observer
+from tmc.kernel.observation import Floats, ObservationBuilder
 from tmc.kernel.world import World
 from tmc.wire import process
 
@@ -61,7 +61,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
     printed = helper.output_of(helper.start(*words, env=plan.environment("tmc", 1)), told)
     held, batch, found = (
         f"{world.config.replay.capacity:,} transitions",
-        world.config.dqn.batch,
+        world.config.dqn.batch_size,
         json.loads(printed),
     )
     return [
@@ -77,15 +77,15 @@ def measure(args: argparse.Namespace) -> list[Row]:
 
 def weigh(values: dict[str, Any], minibatches: int) -> dict[str, Any]:
     """The figures: without priorities and with them. `memory`: None where the system does not tell."""
-    world = World(build({**values, "replay.priority": 0.0}))
+    world = World(build({**values, "replay.priority_exponent": 0.0}))
     before = _resident()
-    replay = Replay(world, Observer(world))
+    replay = Replay(world, ObservationBuilder(world))
     inserted, spent = fill(replay)
     grown = None if before is None else (_resident() or before) - before
     found: dict[str, Any] = {"bytes": weight(replay), "memory": grown, "inserts": inserted / spent}
     found["uniform"] = drawn(replay, minibatches)
-    world = World(build({**values, "replay.priority": values["replay.priority"] or ALPHA}))
-    replay = Replay(world, Observer(world))
+    world = World(build({**values, "replay.priority_exponent": values["replay.priority_exponent"] or ALPHA}))
+    replay = Replay(world, ObservationBuilder(world))
     fill(replay)
     return {**found, "bytes with priorities": weight(replay), "prioritised": drawn(replay, minibatches)}
 
@@ -98,7 +98,7 @@ def weight(replay: Replay) -> float:
 
 def drawn(replay: Replay, minibatches: int) -> list[float]:
     """Milliseconds of the processor that each of so many minibatches takes."""
-    batch, (channels, height, width) = replay.world.config.dqn.batch, replay.observer.shape
+    batch, (channels, height, width) = replay.world.config.dqn.batch_size, replay.observer.shape
     images = np.empty((2 * batch, height, width, channels), np.float32).transpose(0, 3, 1, 2)  # as the learner has them
     rng = np.random.Generator(np.random.Philox(0))
     errors = (rng.exponential(size=batch).astype("f4") for _ in range(minibatches + WARM))
@@ -122,7 +122,7 @@ def _resident() -> float | None:
 def _drawn(replay: Replay, number: int, images: Floats, errors: Floats) -> float:
     """Milliseconds of the processor that minibatch `number` takes; `errors` (B,) are found in it afterwards."""
     start = time.process_time()
-    sample = replay.sample(number, replay.world.config.dqn.batch)
+    sample = replay.sample(number, replay.world.config.dqn.batch_size)
     replay.observer.observe_batch(sample.views, images)
     if replay.priorities is not None:
         replay.priorities.set(sample.index, errors)

@@ -26,7 +26,7 @@ from deploy.bench.row import Row
 from deploy.commands.evaluate import team_sizes
 from deploy.run import lockstep, plan
 from deploy.run.mission import check
-from deploy.run.progress import Observer
+from deploy.run.progress import StatusPoller
 from deploy.run.supervisor import Supervisor
 from tmc.center.journal import Journal
 from tmc.kernel.config import Config, build, flat
@@ -40,7 +40,7 @@ LIMITS = {"private": 35.0, "memory": 4096.0, "start": 15.0}
 """What is asked of a team of 100: MiB of private memory a UAV, MiB in all, seconds until the first tick is flown."""
 MISSION = 0.5
 """Seconds that a mission of processes takes at least."""
-POLL = 0.05
+POLL_S = 0.05
 """Seconds between two looks at the processes."""
 
 
@@ -56,7 +56,7 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Flown:
+class RunData:
     """One mission: UAV steps a second; seconds from start to the first tick; the share of time that UAVs waited for
     peers; beacons a UAV step."""
 
@@ -95,8 +95,8 @@ def measure(args: argparse.Namespace) -> list[Row]:
 def _size(world: World, policy: bytes | None, args: argparse.Namespace, scratch: Path) -> list[Row]:
     """All repeats of one team size: the fleet, then the processes over each transport, and again."""
     transports = TRANSPORTS[args.transport]
-    fleet: list[Flown] = []
-    teams: dict[bool, list[Flown]] = {table: [] for table in transports}
+    fleet: list[RunData] = []
+    teams: dict[bool, list[RunData]] = {table: [] for table in transports}
     for repeat in range(args.repeats):
         fleet.append(fly_fleet(world, policy, _folder(scratch)))
         for table in transports:
@@ -110,7 +110,7 @@ def _size(world: World, policy: bytes | None, args: argparse.Namespace, scratch:
     return rows
 
 
-def _rows(config: Config, transport: str, flown: list[Flown], fleet: list[float]) -> Iterator[Row]:
+def _rows(config: Config, transport: str, flown: list[RunData], fleet: list[float]) -> Iterator[Row]:
     case, memory = f"N={config.team.size} {transport}", flown[0].memory
     rates = [f.rate for f in flown]
     ratio = median(a / b for a, b in zip(rates, fleet, strict=True))
@@ -136,7 +136,7 @@ def _folder(scratch: Path) -> Path:
     return Path(tempfile.mkdtemp(dir=scratch))
 
 
-def fly_fleet(world: World, policy: bytes | None, out: Path) -> Flown:
+def fly_fleet(world: World, policy: bytes | None, out: Path) -> RunData:
     """The reference: the same mission in this process, with the same journal."""
     start = time.time_ns()
     journal = Journal(out, world, "bench")
@@ -147,13 +147,13 @@ def fly_fleet(world: World, policy: bytes | None, out: Path) -> Flown:
     return _read(out, world.config, start)
 
 
-def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool, weigh: bool) -> Flown:
+def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool, weigh: bool) -> RunData:
     """The mission in processes of its own; `weigh`: look at their memory once, half way."""
     config, memory, start = world.config, None, time.time_ns()
     half = config.training.episodes * config.training.ticks // 2
     with started(config, policy, out, table=table) as (supervisor, observer):
         while not supervisor.watch():
-            time.sleep(POLL)
+            time.sleep(POLL_S)
             status = observer.ask()
             if weigh and memory is None and status is not None and status.ticks > half:
                 memory = weigh_all(supervisor.pids())
@@ -164,7 +164,7 @@ def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool,
 @contextmanager
 def started(
     config: Config, policy: bytes | None, out: Path, *, table: bool = True
-) -> Iterator[tuple[Supervisor, Observer]]:
+) -> Iterator[tuple[Supervisor, StatusPoller]]:
     """The processes of a mission in `out`, and who asks how far they are; they are stopped with the block."""
     (out / "config.json").write_text(json.dumps(flat(config)), "utf-8")
     file = None if policy is None else out / "flown.onnx"
@@ -172,7 +172,7 @@ def started(
         file.write_bytes(policy)
     mission = plan.make(config, out, policy=file, table=table)
     supervisor = Supervisor(mission, out, config.training.threads, _say)
-    observer = Observer(mission.endpoint)
+    observer = StatusPoller(mission.endpoint)
     try:
         supervisor.start()
         yield supervisor, observer
@@ -212,7 +212,7 @@ def _rollup(pid: int) -> dict[str, int]:
     return {name: int(size) for name, size in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
 
 
-def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -> Flown:
+def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -> RunData:
     """What the log of a mission says; `start` in ns of the wall clock."""
     files = run_files(out)
     times, beacons = [], 0
@@ -225,7 +225,7 @@ def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -
     steps = config.team.size * config.training.ticks * config.training.episodes
     seconds = times[-1][1] - times[0][1]
     uavs = [path for name, path in files.items() if name.startswith("uav-")]
-    return Flown(
+    return RunData(
         steps / seconds if seconds else math.nan,
         (times[0][0] - start) / 1e9,
         _waits(uavs, times[0][0]),

@@ -40,9 +40,9 @@ ROLES = ("tmc", "actors", "learner")
 """The modules of the roles: `python -m ROLE` imports `ROLE.__main__` and what it needs."""
 TURN = 2.0
 """Seconds that all starts of a turn take at least."""
-PATIENCE = 120.0
+PATIENCE_S = 120.0
 """Seconds after which a start has failed."""
-POLL = 0.05
+POLL_S = 0.05
 """Seconds between two looks at the learner's log."""
 
 
@@ -110,7 +110,7 @@ def imported(role: str, _: Path) -> float:
 def finished(*words: str) -> float:
     """Seconds from the start of a process to its end."""
     start = time.monotonic()
-    subprocess.run(command(*words), env=environment(), stdout=subprocess.DEVNULL, check=True, timeout=PATIENCE)
+    subprocess.run(command(*words), env=environment(), stdout=subprocess.DEVNULL, check=True, timeout=PATIENCE_S)
     return time.monotonic() - start
 
 
@@ -131,9 +131,9 @@ def first_update(out: Path, changes: list[str]) -> float:
     start = time.monotonic()
     with running("run", "quick", *changes, "--out", out) as run:
         while (at := _first_update(out / "learner.mcap.active")) is None:
-            if run.poll() is not None or time.monotonic() - start > PATIENCE:
-                raise MissionFailed(f"overfly run quick made no update in {PATIENCE:g} s")
-            time.sleep(POLL)
+            if run.poll() is not None or time.monotonic() - start > PATIENCE_S:
+                raise MissionFailed(f"overfly run quick made no update in {PATIENCE_S:g} s")
+            time.sleep(POLL_S)
         return time.monotonic() - (time.time_ns() - at) / 1e9 - start  # of the wall clock only the last moments count
 
 
@@ -157,8 +157,8 @@ def first_word(out: Path) -> float:
         tmc = sockets.router(context, endpoint)
         start = time.monotonic()
         with running("actor", "--id", 0, "--connect", endpoint, "--out", out / "U"):
-            if not tmc.poll(int(PATIENCE * 1000)):
-                raise MissionFailed(f"a UAV said nothing for {PATIENCE:g} s")
+            if not tmc.poll(int(PATIENCE_S * 1000)):
+                raise MissionFailed(f"a UAV said nothing for {PATIENCE_S:g} s")
             seconds = time.monotonic() - start
             frames = sockets.receive(tmc) or []
     finally:

@@ -1,5 +1,5 @@
-"""`overfly bench train`: ticks a second of the whole recipe, one minibatch a tick, against the bare compute loop; how
-long a start takes, and what memory all processes use together.
+"""`overfly bench train`: ticks a second of the whole recipe, one minibatch a tick, against the textbook compute loop;
+how long a start takes, and what memory all processes use together.
 
 The missions are those of `overfly bench learner`, which says why they stand for the paper's.
 """
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Bare loop and missions of each size in turns; one row a figure."""
+    """ReferenceLearner loop and missions of each size in turns; one row a figure."""
     values = {**learner.MISSION, "training.threads": args.threads, **settings.chosen(args)}
     sizes = [n for n in team_sizes(args.actors) if n is not None]
     bounds.stretches(args.repeats, args.seconds, 1 + len(sizes))
@@ -36,23 +36,31 @@ def measure(args: argparse.Namespace) -> list[Row]:
     for world in worlds:
         bounds.training(world, learner.warm_up(world.config))
     flown: list[list[learner.Learned]] = [[] for _ in worlds]
-    bare: list[float] = []
+    textbook: list[float] = []
     with tempfile.TemporaryDirectory(prefix="overfly-bench-") as scratch:
         for _ in range(args.repeats):
-            bare.append(learner.bare_loop(worlds[0].config, args.seconds, "bare"))
+            textbook.append(learner.reference_loop(worlds[0].config, args.seconds, "textbook"))
             for world, runs in zip(worlds, flown, strict=True):
                 runs.append(learner.fly(world, args.seconds, Path(tempfile.mkdtemp(dir=scratch))))
             rates = ", ".join(f"N={n} {runs[-1].ticks:.1f}" for n, runs in zip(sizes, flown, strict=True))
-            learner.say(f"bare loop {bare[-1]:.1f} updates/s, ticks/s: {rates}")
-    return [row for n, runs in zip(sizes, flown, strict=True) for row in _rows(n, runs, bare)]
+            learner.say(f"textbook loop {textbook[-1]:.1f} updates/s, ticks/s: {rates}")
+    return [row for n, runs in zip(sizes, flown, strict=True) for row in _rows(n, runs, textbook)]
 
 
-def _rows(size: int, runs: list[learner.Learned], bare: list[float]) -> list[Row]:
+def _rows(size: int, runs: list[learner.Learned], textbook: list[float]) -> list[Row]:
     """The figures of one team size."""
-    ratio = median(run.ticks / loop for run, loop in zip(runs, bare, strict=True))
+    ratio = median(run.ticks / loop for run, loop in zip(runs, textbook, strict=True))
     memory = [run.memory for run in runs if run.memory is not None]
     return [
-        Row("train", f"N={size}", median(run.ticks for run in runs), "ticks/s", median(bare), ratio, "x bare loop"),
+        Row(
+            "train",
+            f"N={size}",
+            median(run.ticks for run in runs),
+            "ticks/s",
+            median(textbook),
+            ratio,
+            "x textbook loop",
+        ),
         *learner.shares("train", f"N={size}", runs),
         Row("train", f"N={size} start", median(run.start for run in runs), "s to the first update"),
         Row("train", f"N={size} memory", median(memory) if memory else None, "MiB in all"),

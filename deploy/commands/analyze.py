@@ -11,7 +11,7 @@ from deploy import extras
 from tmc.analysis.metrics import summarize
 from tmc.analysis.report import pictures as drawing
 from tmc.analysis.report import text as reports
-from tmc.analysis.run_data import Flown, read
+from tmc.analysis.run_data import RunData, read
 from tmc.analysis.summary import Summary
 from tmc.kernel.config import ConfigError
 from tmc.record import disk
@@ -90,7 +90,7 @@ def _keep(path: Path, text: str, *, pictures: bool) -> bool:
     return True
 
 
-def _draw(flown: Flown, summary: Summary, episode: int | None, lines: Mapping[str, float]) -> list[Path]:
+def _draw(flown: RunData, summary: Summary, episode: int | None, lines: Mapping[str, float]) -> list[Path]:
     """The pictures that can be made; a sentence on stderr for each other."""
     if why := extras.lacking(extras.FIGURES):
         process.tell(f"no pictures: {why}")

@@ -33,7 +33,7 @@ WITH_LEARNER = (extras.LEARNER,)
 BENCHES: tuple[Bench, ...] = (
     Bench("rollout", "deploy.bench.rollout", "UAV steps a second of N processes against the fleet in one process"),
     Bench("journal", "deploy.bench.journal", "what the TMC's journal takes, a commit costs, and a UAV step leaves"),
-    Bench("learner", "deploy.bench.learner", "updates a second of a running mission against the bare compute loop",
+    Bench("learner", "deploy.bench.learner", "updates a second of a running mission against the textbook loop",
           WITH_LEARNER),
     Bench("startup", "deploy.bench.startup", "seconds to the first update, to a UAV's first word, and of imports",
           WITH_LEARNER),

@@ -36,7 +36,7 @@ T_975 = (
 
 
 @dataclass(frozen=True)
-class Flight:
+class EpisodeState:
     """One mission: WHO, N, the seed, eq. (6) a road cell, blocked moves by another UAV and in all, wall seconds."""
 
     who: str
@@ -112,7 +112,7 @@ def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | No
     for pilot in pilots:
         for n in team_sizes(args.actors):
             values = {**pilot.values, **shared, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
-            values |= {"team.pilot": pilot.values["team.pilot"]}
+            values |= {"team.controller": pilot.values["team.controller"]}
             values |= {} if n is None else {"team.size": n}
             config = build(values)
             check(config, pilot.policy, pilot.name)
@@ -120,7 +120,7 @@ def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | No
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy
 
 
-def shared_world(pilots: list[policy_spec.Who], chosen: Collection[str] = ()) -> dict[str, Any]:
+def shared_world(pilots: list[policy_spec.PolicySpec], chosen: Collection[str] = ()) -> dict[str, Any]:
     """The world of the run folders among WHO, for everybody in the table; ConfigError when they do not agree on what
     is not `chosen` for all of them."""
     worlds = [{k: v for k, v in p.values.items() if k in WORLD or k.startswith("world.")} for p in pilots]
@@ -139,7 +139,7 @@ def _same(key: str, value: Any, other: Any) -> bool:
     return bool(value == other)
 
 
-def fly_one(mission: tuple[str, Config, bytes | None]) -> Flight:
+def fly_one(mission: tuple[str, Config, bytes | None]) -> EpisodeState:
     """Fly one mission in lock step; nothing is logged."""
     name, config, policy = mission
     world = World(config)
@@ -151,7 +151,7 @@ def fly_one(mission: tuple[str, Config, bytes | None]) -> Flight:
         raise FlightError(f"{name}, seed {config.training.seed}: {error}") from None
     station, cells = fleet.station, world.law.cells.size
     seconds = time.perf_counter() - start
-    return Flight(
+    return EpisodeState(
         name, config.team.size, config.training.seed, station.episode_uncertainty / cells, bound_of(world) / cells,
         station.blocked_by_uav, station.blocked, seconds,
     )  # fmt: skip
@@ -161,14 +161,14 @@ def _forget(_outbox: Outbox) -> None:
     """An evaluation keeps no journal."""
 
 
-def fly_all(work: list[tuple[str, Config, bytes | None]], jobs: int) -> list[Flight]:
+def fly_all(work: list[tuple[str, Config, bytes | None]], jobs: int) -> list[EpisodeState]:
     """Fly all missions on `jobs` processes, with progress."""
     if jobs == 1 or len(work) == 1:
         return list(_progress(map(fly_one, work), len(work)))
     return list(_progress(pool.call_each(fly_one, work, jobs), len(work)))
 
 
-def _progress(flights: Iterable[Flight], total: int) -> Iterator[Flight]:
+def _progress(flights: Iterable[EpisodeState], total: int) -> Iterator[EpisodeState]:
     start, said = time.monotonic(), time.monotonic()
     for done, flight in enumerate(flights, 1):
         now = time.monotonic()
@@ -179,15 +179,15 @@ def _progress(flights: Iterable[Flight], total: int) -> Iterator[Flight]:
         yield flight
 
 
-def table(flights: list[Flight]) -> list[Row]:
+def table(flights: list[EpisodeState]) -> list[Row]:
     """One row for each WHO and N, in the order flown."""
-    groups: dict[tuple[str, int], list[Flight]] = {}
+    groups: dict[tuple[str, int], list[EpisodeState]] = {}
     for flight in flights:
         groups.setdefault((flight.who, flight.actors), []).append(flight)
     return [_row(who, n, group) for (who, n), group in groups.items()]
 
 
-def _row(name: str, n: int, group: list[Flight]) -> Row:
+def _row(name: str, n: int, group: list[EpisodeState]) -> Row:
     def average(field: str) -> float:
         return float(mean(getattr(f, field) for f in group))
 

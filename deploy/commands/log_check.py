@@ -1,4 +1,4 @@
-"""`overfly log check | recover | seal`: is a log true, what of it can be saved, and how it is kept."""
+"""`overfly log check | recover | compact`: is a log true, what of it can be saved, and how it is kept."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deploy.run.line import Line
 from tmc.analysis.invariants import check
 from tmc.kernel.text import printable
 from tmc.record.errors import NoLogError, RecordError
-from tmc.record.mcap.compact import seal_run
+from tmc.record.mcap.compact import compact_run
 from tmc.record.mcap.recover import Recovery, recover
 from tmc.record.reader import logs_in
 from tmc.wire.process import DONE, FAILED, USAGE, tell
@@ -24,8 +24,8 @@ LOSS = 3
 """Exit code: done, but something is lost."""
 ABOUT = {
     "check": "replay the TMC's journal and check every invariant of a flight",
-    "recover": "make sound, finished files of what is cut or damaged",
-    "seal": "rewrite a run's logs for keeping: large chunks, finished names",
+    "recover": "make intact, finished files of what is cut or damaged",
+    "compact": "rewrite a run's logs for keeping: large chunks, finished names",
 }
 
 
@@ -35,7 +35,7 @@ def add_options(view: str, parser: argparse.ArgumentParser) -> None:
         parser.add_argument("run", type=Path, metavar="RUN", help="run folder, or one MCAP file")
         where = parser.add_mutually_exclusive_group()
         where.add_argument("--out", type=Path, metavar="FILE", help="of one file (default: X.recovered.mcap)")
-        where.add_argument("--in-place", action="store_true", help="put the sound file in the place of the other")
+        where.add_argument("--in-place", action="store_true", help="put the intact file in the place of the other")
         return
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
 
@@ -75,19 +75,19 @@ def _failed(error: RecordError) -> int:
     return USAGE if isinstance(error, NoLogError) else FAILED
 
 
-def _seal(args: argparse.Namespace) -> int:
+def _compact(args: argparse.Namespace) -> int:
     try:
         with Line(delay=PATIENCE_S) as line:
-            sealed = seal_run(args.run, line.share)
+            compacted = compact_run(args.run, line.share)
     except RecordError as error:
         return _failed(error)
-    for file in sealed:
+    for file in compacted:
         torn = f"; a torn end of {file.dropped:,} bytes was dropped" if file.dropped else ""
         sizes = f"{file.before:,} bytes before, {file.after:,} after, {file.messages:,} messages"
         print(printable(f"{file.path}: {sizes}{torn}"))
-    before, after = sum(f.before for f in sealed), sum(f.after for f in sealed)
-    print(f"{len(sealed)} files: {before:,} bytes before, {after:,} after ({after / before:.0%})")
-    return LOSS if any(file.dropped for file in sealed) else DONE
+    before, after = sum(f.before for f in compacted), sum(f.after for f in compacted)
+    print(f"{len(compacted)} files: {before:,} bytes before, {after:,} after ({after / before:.0%})")
+    return LOSS if any(file.dropped for file in compacted) else DONE
 
 
-MAINS: dict[str, Callable[[argparse.Namespace], int]] = {"check": _check, "recover": _recover, "seal": _seal}
+MAINS: dict[str, Callable[[argparse.Namespace], int]] = {"check": _check, "recover": _recover, "compact": _compact}

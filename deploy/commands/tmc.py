@@ -12,7 +12,7 @@ from tmc.__main__ import serve
 from tmc.kernel.config import Config, ConfigError, build, flat
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import seal_log
+from tmc.record.mcap.compact import compact_log
 from tmc.wire.process import DONE, tell
 from tmc.wire.sockets import check_free
 
@@ -78,8 +78,8 @@ def _sealed(code: int, config: Config, out: Path) -> int:
     """The exit code of a TMC, whose journal is rewritten for keeping when its mission is over."""
     if code == DONE:
         try:
-            sealed = seal_log(out / "tmc.mcap", Progress(config, 1, 0.0).work)
-            print(f"overfly: the log is sealed: {sealed.before:,} bytes before, {sealed.after:,} after")
+            compacted = compact_log(out / "tmc.mcap", Progress(config, 1, 0.0).work)
+            print(f"overfly: the log is compacted: {compacted.before:,} bytes before, {compacted.after:,} after")
         except RecordError as error:
             tell(f"the log stays as it was written: {error}")
     return code

@@ -85,7 +85,7 @@ def listed(option: str, text: str, choices: tuple[str, ...] = ()) -> list[str]:
     return items
 
 
-# Exactness.
+# DeliveryReport.
 
 
 def _exactness(args: argparse.Namespace) -> int:

@@ -16,8 +16,8 @@ from deploy import extras, policy_spec, settings
 from deploy.run.mission import check, needs, new_folder
 from deploy.run.progress import clock
 from deploy.verify.chaos import trial
-from deploy.verify.chaos.faults import CUT, POWER, STOP, Blow, blows
-from deploy.verify.chaos.schedule import Storm
+from deploy.verify.chaos.faults import CUT, POWER, STOP, Fault, draw_faults
+from deploy.verify.chaos.schedule import FaultSchedule
 from tmc.center.roster import LEARNER, uav_name
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.wire import process
@@ -27,7 +27,7 @@ MODES = ("train", "fly")
 ROLES = ("tmc", LEARNER, "uav", POWER)
 
 
-SLOW = {"journal.commit": 1.0, "journal.flush": 1.0}
+SLOW = {"journal.commit_interval": 1.0, "journal.flush_interval": 1.0}
 """Of the counter-check: in a training an acknowledgement comes some 0.2 s after its record. One that comes after the
 commit is not too early."""
 
@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mode", choices=MODES, default="train", help="a training, or missions of a fixed pilot that "
                         "must end as they do in lock step (default: train)")  # fmt: skip
     parser.add_argument("--kills", type=int, default=200, metavar="K", help="kill -9, in all (default: 200)")
-    parser.add_argument("--storm", type=int, default=1, metavar="S", help="seed of the blows (default: 1)")
+    parser.add_argument("--fault-seed", type=int, default=1, metavar="S", help="seed of the faults (default: 1)")
     parser.add_argument("--who", default="planner:greedy", help="who flies with --mode fly: policy, run or planner")
     parser.add_argument("--power", action="store_true", help="half of the kills are power cuts; the journal is synced")
     parser.add_argument("--ack-early", action="store_true", help="the counter-check: a TMC that acknowledges too early "
@@ -52,27 +52,27 @@ def main(args: argparse.Namespace, say: Callable[[str], None], clear: Callable[[
     """Run the trial; exit code 1 when anything is not as it should be."""
     config, policy = _config(args)
     extras.require(*needs(config, policy))
-    storm_blows = _blows(args, config)
+    storm_blows = _faults(args, config)
     place = Path(tempfile.mkdtemp(prefix="overfly-chaos-")) if args.keep is None else new_folder(args.keep, "chaos")
-    storm = Storm(storm_blows, say, place / "diary.txt", until_loss=args.ack_early)
+    schedule = FaultSchedule(storm_blows, say, place / "diary.txt", until_loss=args.ack_early)
     start = time.monotonic()
     try:
-        verdict = trial.run(config, policy, place, storm, trains=args.mode == "train")
+        result = trial.run(config, policy, place, schedule, trains=args.mode == "train")
     except KeyboardInterrupt:
         clear()
         if args.keep is None:
             shutil.rmtree(place)
         raise
     clear()
-    good = not verdict.faults
+    good = not result.faults
     kept = "" if good and args.keep is None else str(place)
     if not kept:
         shutil.rmtree(place)
     seconds = time.monotonic() - start
     if args.json:
-        print(json.dumps(as_json(verdict, seconds) | {"folder": kept}), flush=True)
+        print(json.dumps(as_json(result, seconds) | {"folder": kept}), flush=True)
     else:
-        print("\n".join([*table(verdict), "", *conclusion(verdict, seconds, kept, early=args.ack_early)]), flush=True)
+        print("\n".join([*table(result), "", *conclusion(result, seconds, kept, early=args.ack_early)]), flush=True)
     return process.DONE if good else process.FAILED
 
 
@@ -91,59 +91,60 @@ def _config(args: argparse.Namespace) -> tuple[Config, bytes | None]:
     return build({**settings.chosen(args), **policy_spec.pilot_of(pilot)}, base), pilot.policy
 
 
-def _blows(args: argparse.Namespace, config: Config) -> list[Blow]:
+def _faults(args: argparse.Namespace, config: Config) -> list[Fault]:
     world = check(config)
     team = [uav_name(i) for i in range(world.config.team.size)]
     names = ["tmc"] if args.ack_early else ["tmc", *([LEARNER] if args.mode == "train" else []), *team]
-    return blows(args.kills, args.storm, names, power=args.power)
+    return draw_faults(args.kills, args.fault_seed, names, power=args.power)
 
 
-def everybody(storm: Storm) -> list[float]:
+def everybody(schedule: FaultSchedule) -> list[float]:
     """Seconds that each recovery took, whoever was killed."""
-    return [took for role in ROLES for took in storm.recoveries[role]]
+    return [took for role in ROLES for took in schedule.recoveries[role]]
 
 
-def table(verdict: trial.Verdict) -> Iterator[str]:
+def table(result: trial.TrialResult) -> Iterator[str]:
     """What was done, and what came of it."""
-    storm = verdict.storm
+    schedule = result.schedule
     yield f"{'killed':<14} {'times':>6} {'came back':>10} {'median':>9} {'worst':>9}"
-    lines = [(role, storm.kills[role], storm.backs[role], storm.recoveries[role]) for role in ROLES]
-    lines += [("all", sum(storm.kills.values()), sum(storm.backs.values()), everybody(storm))]
+    lines = [(role, schedule.kills[role], schedule.backs[role], schedule.recoveries[role]) for role in ROLES]
+    lines += [("all", sum(schedule.kills.values()), sum(schedule.backs.values()), everybody(schedule))]
     for role, kills, backs, took in lines:
         if kills:
             times = f"{median(took):>7.2f} s {max(took):>7.2f} s" if took else f"{'-':>9} {'-':>9}"
             yield f"{'power cut' if role == POWER else role:<14} {kills:>6} {backs:>10} {times}"
-    rows = [("stopped a while", storm.count(STOP)), ("cut off a while", storm.count(CUT))]
-    rows += [("journal cut, bytes", storm.cut_off)] if storm.kills[POWER] else []
-    rows += [("missions", verdict.missions)]
-    rows += [(name, verdict.sum(name)) for name in ("episodes", "ticks", "updates")]
-    rows += [(f"records {what}", verdict.sum(what)) for what in ("journalled", "acknowledged", "lost")]
-    rows += [("records applied twice", verdict.sum("doubled")), ("facts checked", verdict.facts)]
+    rows = [("stopped a while", schedule.count(STOP)), ("cut off a while", schedule.count(CUT))]
+    rows += [("journal cut, bytes", schedule.cut_off)] if schedule.kills[POWER] else []
+    rows += [("missions", result.missions)]
+    rows += [(name, result.sum(name)) for name in ("episodes", "ticks", "updates")]
+    rows += [(f"records {what}", result.sum(what)) for what in ("journalled", "acknowledged", "lost")]
+    rows += [("records applied twice", result.sum("doubled")), ("facts checked", result.facts)]
     yield ""
     yield from (f"{name:<22} {value:>12,}" for name, value in rows)
 
 
-def conclusion(verdict: trial.Verdict, seconds: float, kept: str, *, early: bool) -> Iterator[str]:
-    """The verdict in sentences."""
-    kills, lost = sum(verdict.storm.kills.values()), verdict.sum("lost")
+def conclusion(result: trial.TrialResult, seconds: float, kept: str, *, early: bool) -> Iterator[str]:
+    """The result in sentences."""
+    kills, lost = sum(result.schedule.kills.values()), result.sum("lost")
     if early:
         yield (f"acknowledged too early, {lost:,} records were lost: the trial sees losses when there are some"
                if lost else "acknowledged too early, and no loss was seen: give it more kills")  # fmt: skip
-    elif not verdict.faults:
+    elif not result.faults:
         yield f"{kills} kills in {clock(seconds)}: nothing was lost, nothing doubled, everybody came back"
-    yield from (f"overfly: {fault}" for fault in verdict.faults)
+    yield from (f"overfly: {fault}" for fault in result.faults)
     if kept:
         yield f"run folders and diary are in {kept}"
 
 
-def as_json(verdict: trial.Verdict, seconds: float) -> dict[str, Any]:
+def as_json(result: trial.TrialResult, seconds: float) -> dict[str, Any]:
     """All of the table."""
-    storm = verdict.storm
+    schedule = result.schedule
     counts = ("episodes", "ticks", "updates", "journalled", "acknowledged", "lost", "doubled")
     return {
-        "kills": dict(storm.kills), "back": dict(storm.backs), "stops": storm.count(STOP), "cuts": storm.count(CUT),
+        "kills": dict(schedule.kills), "back": dict(schedule.backs), "stops": schedule.count(STOP),
+        "cuts": schedule.count(CUT),
         "recovery": {role: {"median": round(median(took), 3), "worst": round(max(took), 3)}
-                     for role, took in (*storm.recoveries.items(), ("all", everybody(storm))) if took},
-        "missions": verdict.missions, **{name: verdict.sum(name) for name in counts}, "facts": verdict.facts,
-        "bytes_cut": storm.cut_off, "faults": verdict.faults, "seconds": round(seconds, 1),
+                     for role, took in (*schedule.recoveries.items(), ("all", everybody(schedule))) if took},
+        "missions": result.missions, **{name: result.sum(name) for name in counts}, "facts": result.facts,
+        "bytes_cut": schedule.cut_off, "faults": result.faults, "seconds": round(seconds, 1),
     }  # fmt: skip

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from actors.fleet import Fleet
-from actors.observation_hash import Witness
+from actors.observation_hash import ObservationHasher
 from actors.pilot import Pilot
-from actors.planners import PREFIX, Decider, PlannerDecider
+from actors.planners import PREFIX, Controller, PlannerController
 from actors.tracks import TableTracks, TrackTable
 from deploy.run.progress import Progress
 from tmc.center.journal import Journal
@@ -18,7 +18,7 @@ from tmc.center.roster import LEARNER, Outbox, uav_name
 from tmc.center.station import Station
 from tmc.center.status import status
 from tmc.kernel.config import ConfigError
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
 from tmc.record.writer import LogWriter
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 RUN = "lockstep"
 """What its log calls the run of a mission in one process."""
-Testify = Callable[[int, Any], None]
-"""Takes UAV i's overfly.Witness to the moves of a record."""
+KeepHashes = Callable[[int, Any], None]
+"""Takes UAV i's overfly.ObservationHashes to the moves of a record."""
 
 
 class LockStep:
     """A mission without sockets. `keep` gets every outbox of the station before its messages are delivered.
 
-    `testify`: who wants to know what the UAVs decide by; None outside of trials.
+    `keep_hashes`: who wants to know what the UAVs decide by; None outside of trials.
     """
 
     def __init__(
@@ -46,23 +46,25 @@ class LockStep:
         policy: bytes | None,
         keep: Callable[[Outbox], None],
         trainer: Trainer | None = None,
-        testify: Testify | None = None,
+        keep_hashes: KeepHashes | None = None,
     ) -> None:
         config = world.config
-        self.world, self.keep, self.trainer, self.testify = world, keep, trainer, testify
+        self.world, self.keep, self.trainer, self.keep_hashes = world, keep, trainer, keep_hashes
         self.station = Station(world, RUN, learning=trainer is not None, policy=policy)
         observer = self.station.observer
         table = TrackTable(config.team.size, config.training.ticks)
-        planner = PlannerDecider(world, config.team.pilot) if config.team.pilot.startswith(PREFIX) else None
-        decider = _decider_maker(world, observer)
-        self._witnesses = [Witness(observer) for _ in range(config.team.size)]
+        planner = (
+            PlannerController(world, config.team.controller) if config.team.controller.startswith(PREFIX) else None
+        )
+        controller = _controller_maker(world, observer)
+        self._hashers = [ObservationHasher(observer) for _ in range(config.team.size)]
 
         def pilot(i: int) -> Pilot:
-            tracks, watch = TableTracks(table, i), self._witnesses[i].watch
-            if testify is None:
-                return Pilot(world, i, 1, tracks, observer, decider, planner)
+            tracks, watch = TableTracks(table, i), self._hashers[i].watch
+            if keep_hashes is None:
+                return Pilot(world, i, 1, tracks, observer, controller, planner)
             watched = watch(planner) if planner else None
-            return Pilot(world, i, 1, tracks, observer, lambda model: watch(decider(model)), watched)
+            return Pilot(world, i, 1, tracks, observer, lambda model: watch(controller(model)), watched)
 
         pilots = [pilot(i) for i in range(config.team.size)]
         self.fleet = Fleet(pilots, self._exchange)
@@ -70,13 +72,13 @@ class LockStep:
         self._loss, self.final = 0.0, b""
         """Of the last update, and the policy file that was learned, once all has been."""
         if trainer is not None:
-            from learner.batching import Intake  # noqa: PLC0415  torch only where something is learned
+            from learner.batching import BatchBuilder  # noqa: PLC0415  torch only where something is learned
 
-            self._intake = Intake(observer)
+            self._builder = BatchBuilder(observer)
 
     def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:
-        if self.testify is not None and isinstance(message, m.Record):
-            self.testify(uav, self._witnesses[uav].testify(message))
+        if self.keep_hashes is not None and isinstance(message, m.Record):
+            self.keep_hashes(uav, self._hashers[uav].hashes_for(message))
         self.station.handle(uav_name(uav), message, 0.0)
         return self._take()
 
@@ -112,11 +114,11 @@ class LockStep:
         """Train on every minibatch that the limiter lets through; True when there was one."""
         trainer, learned = self.trainer, False
         while trainer is not None and self._minibatches:
-            metrics = trainer.update(self._intake.read(self._minibatches.pop(0)))
+            metrics = trainer.update(self._builder.build(self._minibatches.pop(0)))
             learned, self._loss = True, metrics.loss
-            if metrics.updates % self.world.config.training.push_every == 0:
+            if metrics.updates % self.world.config.training.publish_every == 0:
                 self._push(metrics.loss)
-            self._tell(m.SampleRequest(metrics.updates, *trainer.judged()))
+            self._tell(m.SampleRequest(metrics.updates, *trainer.take_td_errors()))
         return learned
 
     def _push(self, loss: float = 0.0) -> bytes:
@@ -126,16 +128,16 @@ class LockStep:
         return model
 
 
-def _decider_maker(world: World, observer: Observer) -> Callable[[bytes], Decider]:
+def _controller_maker(world: World, observer: ObservationBuilder) -> Callable[[bytes], Controller]:
     """UAVs in one process share the session of a policy file; it holds no state of theirs."""
-    made: dict[bytes, Decider] = {}
+    made: dict[bytes, Controller] = {}
 
-    def make(model: bytes) -> Decider:
-        from actors.policy import NetworkDecider  # noqa: PLC0415  planners fly without ONNX Runtime
+    def make(model: bytes) -> Controller:
+        from actors.policy import PolicyController  # noqa: PLC0415  planners fly without ONNX Runtime
 
         if model not in made:
             made.clear()
-            made[model] = NetworkDecider(model, world.config, observer)
+            made[model] = PolicyController(model, world.config, observer)
         return made[model]
 
     return make
@@ -145,14 +147,14 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
     """Fly a mission in this process, with the same log as the TMC process writes."""
     config = world.config
     trainer = None
-    if policy is None and config.team.pilot == "policy":
+    if policy is None and config.team.controller == "policy":
         from learner.trainer import start  # noqa: PLC0415  torch only where something is learned
 
         trainer = start(config, world.grid)
     journal = Journal(out, world, RUN)
     try:
-        with _testimonies(world, out) as testify:
-            mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, testify)
+        with _hash_logs(world, out) as keep_hashes:
+            mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, keep_hashes)
             _run(mission, progress.show)
         if trainer is not None:
             from learner.service import write_policy  # noqa: PLC0415
@@ -176,10 +178,10 @@ def _run(mission: LockStep, show: Callable[[m.Status], None]) -> None:
 
 
 @contextmanager
-def _testimonies(world: World, out: Path) -> Iterator[Testify | None]:
-    """Where witnesses testify: in the logs that the UAVs would write; nowhere outside of trials."""
+def _hash_logs(world: World, out: Path) -> Iterator[KeepHashes | None]:
+    """Where witnesses keep_hashes: in the logs that the UAVs would write; nowhere outside of trials."""
     config = world.config
-    if not config.trial.witness:
+    if not config.trial.observation_hash:
         yield None
         return
     with ExitStack() as stack:
@@ -187,7 +189,7 @@ def _testimonies(world: World, out: Path) -> Iterator[Testify | None]:
         facts = {"run": RUN}
         logs = [stack.enter_context(LogWriter(out / f"{n}.mcap", n, config.journal, facts)) for n in names]
 
-        def testify(uav: int, message: Any) -> None:
-            logs[uav].write(uav_topic(uav, "witness"), message)
+        def keep_hashes(uav: int, message: Any) -> None:
+            logs[uav].write(uav_topic(uav, "observation_hash"), message)
 
-        yield testify
+        yield keep_hashes

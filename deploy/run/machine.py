@@ -64,7 +64,7 @@ def require(config: Config, *, learns: bool, alone: bool = False, out: Path = Pa
 def needs(config: Config, *, learns: bool, alone: bool = False) -> Iterator[Need]:
     """Every limit that matters to a mission."""
     n, steps = config.team.size, config.team.size * min(config.training.ticks * config.training.episodes, HORIZON_TICKS)
-    planner = config.team.pilot.startswith(PREFIX)
+    planner = config.team.controller.startswith(PREFIX)
     replay = ROW_BYTES * min(config.replay.capacity, steps) if learns else 0
     log = LOG_BYTES + STEP_BYTES * steps
     table = 0 if alone else table_bytes(n, config.training.ticks)

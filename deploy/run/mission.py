@@ -17,7 +17,7 @@ from typing import Any
 from actors.planners import PLANNERS, PREFIX
 from deploy import extras, policy_spec
 from deploy.run import lockstep, plan
-from deploy.run.progress import Observer, Progress
+from deploy.run.progress import Progress, StatusPoller
 from deploy.run.supervisor import MissionFailed, Supervisor
 from tmc.analysis.run_config import attachments, settings_of
 from tmc.center.journal import journal_in
@@ -29,11 +29,11 @@ from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World, world_of_run
 from tmc.record import disk
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import seal_log
+from tmc.record.mcap.compact import compact_log
 from tmc.record.reader import Log
 from tmc.wire import capacity, process
 
-POLL = 0.1
+POLL_S = 0.1
 """Seconds between two looks at the processes."""
 
 
@@ -68,9 +68,9 @@ def check(config: Config, policy: bytes | None = None, name: str = "the policy")
 
     `name`: what messages call the policy.
     """
-    if config.team.pilot != "policy" and config.team.pilot.removeprefix(PREFIX) not in PLANNERS:
+    if config.team.controller != "policy" and config.team.controller.removeprefix(PREFIX) not in PLANNERS:
         known = ", ".join(PREFIX + name for name in PLANNERS)
-        raise ConfigError(f"team.pilot = {config.team.pilot} is neither policy nor {known}")
+        raise ConfigError(f"team.controller = {config.team.controller} is neither policy nor {known}")
     world = World(config)
     _check(world, policy, name)
     return world
@@ -205,7 +205,7 @@ class Mission:
                 self._ended = {"exit_codes": {lockstep.RUN: process.DONE}}
             else:
                 self._fly()
-            self._seal()
+            self._compact()
         except RecordError:
             if self._is_there():
                 raise
@@ -226,11 +226,11 @@ class Mission:
     def _fly(self) -> None:
         mission = plan.make(self.config, self.out, policy=self.policy)
         supervisor = Supervisor(mission, self.out, self.config.training.threads, self.progress.note)
-        observer = Observer(mission.endpoint)
+        observer = StatusPoller(mission.endpoint)
         try:
             supervisor.start()
             while not supervisor.watch():
-                time.sleep(POLL)
+                time.sleep(POLL_S)
                 if not self._is_there():
                     raise MissionFailed(self._gone())
                 status = observer.ask()
@@ -253,14 +253,14 @@ class Mission:
     def _gone(self) -> str:
         return f"the run folder {self.out} was removed or moved while the mission was flown: fly it again"
 
-    def _seal(self) -> None:
+    def _compact(self) -> None:
         """Rewrite the journal of a mission that is over for keeping; its sizes are in `run.json`."""
         try:
-            sealed = seal_log(self.out / "tmc.mcap", self.progress.work)
+            compacted = compact_log(self.out / "tmc.mcap", self.progress.work)
         except RecordError as error:  # all of it is there, in small chunks
             self.progress.note(f"the log stays as it was written: {error}")
         else:
-            self._ended["sealed"] = {"before": sealed.before, "after": sealed.after}
+            self._ended["compacted"] = {"before": compacted.before, "after": compacted.after}
 
     def _write_run(self, more: dict[str, Any]) -> None:
         """`run.json`: what was run, and resumed, with which versions, and how each process ended."""

@@ -55,7 +55,7 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
     as one word with their option, since a name may begin with a dash. Raises ConfigError where this machine lacks what
     the mission needs.
     """
-    learns = policy is None and config.team.pilot == "policy"
+    learns = policy is None and config.team.controller == "policy"
     machine.require(config, learns=learns, out=out)
     out, shared = out.absolute(), scratch.make(config, table=table)
     tmc = [sys.executable, "-P", "-m", "tmc"]  # -P: the user's folder may hold packages of the same names
@@ -70,7 +70,7 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
     for i in range(config.team.size):
         children.append(Child(f"uav-{i:03d}", ("--id", str(i), *common), restart=True, fork_of="actors"))
     # A planner flies without ONNX Runtime, 16 MB of memory that nobody would use.
-    preload = {} if config.team.pilot.startswith(PREFIX) else {"actors": ("actors.policy",)}
+    preload = {} if config.team.controller.startswith(PREFIX) else {"actors": ("actors.policy",)}
     return Plan(tuple(children), shared.endpoint, shared.tracks, shared.folder, preload, shared.held)
 
 

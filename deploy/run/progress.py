@@ -15,7 +15,7 @@ from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError
 
 
-class Observer:
+class StatusPoller:
     """Asks the TMC how far it is, and never waits for the answer."""
 
     def __init__(self, endpoint: str) -> None:

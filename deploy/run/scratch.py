@@ -19,7 +19,7 @@ from tmc.kernel.text import printable
 from tmc.wire.endpoints import FEED, LONGEST_PATH
 
 NAME, HELD = "overfly-", "held"
-"""How the names of these folders begin, and the file in each that is locked while its supervisor lives."""
+"""How the names of these folders begin, and the file in each that is locked while its supervisor incarnations."""
 MEMORY = Path("/dev/shm")
 """Memory-backed: the track table must not wait for a disk."""
 ELSEWHERE = (Path("/tmp"), Path("/var/tmp"))

@@ -18,22 +18,22 @@ from deploy.run.suspension import Suspension
 from tmc.kernel.text import printable
 from tmc.wire import process
 
-BACKOFF = (0.1, 5.0)
+BACKOFF_S = (0.1, 5.0)
 """Seconds before a crashed process is started again: the first time, and at most; doubles in between."""
-STEADY = 10.0
+STEADY_S = 10.0
 """Seconds up after which a crash counts as the first again."""
-TRIES = 6
+MAX_CRASHES = 6
 """Crashes in a row after which the run is given up."""
 _ORDERLY = {128 + s for s in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
 OUTSIDE = {-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, *_ORDERLY}
 """Ends that somebody else brought about: the process is started again, and it does not count as a crash."""
-INFANCY = 0.4
+START_TIME_S = 0.4
 """Seconds in which a TMC that was started has not sent anybody home yet: it takes longer to import what it needs."""
-OVERDUE = 5.0
+LEAVE_TIMEOUT_S = 5.0
 """Seconds after which a TMC that still runs needs whoever left: it stays for 3 s at most once everybody has."""
-FULL = 2**20
+FULL_DISK_BYTES = 2**20
 """Free bytes of a disk that counts as full when a process fails."""
-GRACE = 15.0
+GRACE_S = 15.0
 """Seconds that processes get to leave before they are killed."""
 FINAL = {process.USAGE, process.FENCED}
 """Exit codes after which a process is not started again."""
@@ -125,7 +125,7 @@ class Supervisor:
             elif code == 0:
                 running.left = running.left or time.monotonic()
                 if self._left_a_former_life(running):
-                    self._again(running, "left before the TMC was back", BACKOFF[0])
+                    self._again(running, "left before the TMC was back", BACKOFF_S[0])
         return False
 
     def _reap_orphans(self) -> None:
@@ -139,26 +139,26 @@ class Supervisor:
                 os.waitpid(ended.si_pid, 0)
 
     def _left_a_former_life(self, running: _Running) -> bool:
-        """Whether it was sent home by a life of the TMC that is over: the next one may need it all the same."""
+        """Whether it was sent home by an incarnation of the TMC that is over: the next one may need it all the same."""
         lead = next((r for r in self.running if r.child.leads and r.handle is not None), None)
         if lead is None or running.started > lead.started:
             return False
-        return running.left < lead.started + INFANCY or time.monotonic() > running.left + OVERDUE
+        return running.left < lead.started + START_TIME_S or time.monotonic() > running.left + LEAVE_TIMEOUT_S
 
     def _ended(self, running: _Running, code: int) -> None:
         """A process ended that should not have: start it again, or give up."""
         child, up = running.child, time.monotonic() - running.started
         crashed = code not in OUTSIDE
-        running.crashes = crashed + (0 if up > STEADY else running.crashes)
+        running.crashes = crashed + (0 if up > STEADY_S else running.crashes)
         how = process.how_it_ended(code)
         log = self.log_of(child.name)
         reason = self._reason(child, code)
-        if crashed and shutil.disk_usage(self.out).free < FULL:  # then its own sentence found no room either
+        if crashed and shutil.disk_usage(self.out).free < FULL_DISK_BYTES:  # then its own sentence found no room either
             mend = f"free some space, and go on with `overfly run --resume {self.out}`"
             raise MissionFailed(f"{child.name} {how}: the disk that holds {self.out} is full; {mend}")
-        if not child.restart or code in FINAL or running.crashes >= TRIES:
+        if not child.restart or code in FINAL or running.crashes >= MAX_CRASHES:
             raise MissionFailed(f"{child.name} {how}{reason}; its output is in {log}")
-        delay = min(BACKOFF[0] * 2 ** (running.crashes - 1), BACKOFF[1]) if crashed else BACKOFF[0]
+        delay = min(BACKOFF_S[0] * 2 ** (running.crashes - 1), BACKOFF_S[1]) if crashed else BACKOFF_S[0]
         self._again(running, f"{how}{reason}", delay)
 
     def _again(self, running: _Running, how: str, delay: float) -> None:
@@ -191,7 +191,7 @@ class Supervisor:
             for running in group:
                 if running.handle is not None:
                     running.handle.send_signal(signal.SIGTERM)
-            self.wait(GRACE, group)
+            self.wait(GRACE_S, group)
 
     def wait(self, patience: float, group: list[_Running] | None = None) -> None:
         """Wait for everybody (or a group) to leave; kill who has not after `patience` seconds."""

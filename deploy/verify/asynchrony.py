@@ -79,12 +79,12 @@ class Result:
 
     @property
     def good(self) -> bool:
-        """Flown as in lock step, nobody ahead wrongly; and, where a lead was to be expected, there was one."""
+        """RunData as in lock step, nobody ahead wrongly; and, where a lead was to be expected, there was one."""
         expected = min(self.trial.period, self.trial.ticks, SIDE // 2) // 2 if self.trial.apart else 0
         return self.difference is None and self.ahead.right and self.ahead.ticks >= expected
 
     @property
-    def verdict(self) -> str:
+    def result(self) -> str:
         """In words."""
         if self.difference is not None:
             return f"DIFFERENT: {self.difference}"
@@ -97,7 +97,7 @@ class Result:
         ahead = self.ahead
         return (
             f"{self.trial.about:<34} {self.trial.ticks:>5} {ahead.ticks:>5} {ahead.uav:>4} {self.held_back:>5} "
-            f"{ahead.at:>7} {ahead.cells:>6}  {ahead.bound:<9} {self.seconds:>7.1f}  {self.verdict}"
+            f"{ahead.at:>7} {ahead.cells:>6}  {ahead.bound:<9} {self.seconds:>7.1f}  {self.result}"
         )
 
 
@@ -159,7 +159,7 @@ def fly(trial: Trial, team: int, hold: float, base: Mapping[str, Any], policy: b
 
 
 def farthest(config: Config, facts: compare.Facts, flight: Path, held_back: int) -> Ahead:
-    """Who was farthest ahead, by the logs of the UAVs, and where the two were then."""
+    """PolicySpec was farthest ahead, by the logs of the UAVs, and where the two were then."""
     found = []
     for uav in set(range(config.team.size)) - {held_back}:
         *_, last = read(run_files(flight)[f"uav-{uav:03d}"], [uav_topic(uav, "status")])

@@ -73,7 +73,7 @@ def fly_both(config: Config, policy: bytes | None, folder: Path) -> tuple[compar
 
     Raises Stopped; of a mission that the user stopped nothing is left.
     """
-    world = check(build({"trial.witness": True}, config), policy)
+    world = check(build({"trial.observation_hash": True}, config), policy)
     try:
         for name in (PROCESSES, LOCKSTEP):
             fly(world, policy, folder / name, in_one_process=name == LOCKSTEP)

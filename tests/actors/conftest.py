@@ -9,12 +9,12 @@ import pytest
 
 from actors.fleet import Fleet
 from actors.pilot import Pilot
-from actors.planners import PlannerDecider
+from actors.planners import PlannerController
 from actors.tracks import TableTracks, TrackTable
 from tmc.center.roster import uav_name
 from tmc.center.station import Station
 from tmc.kernel.config import build
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
 from tmc.kernel.world import World
 from tmc.wire import messages as m
@@ -32,15 +32,15 @@ RASTER = """\
 """
 
 
-class Flown:
+class RunData:
     """A mission of planners in lock step, with a TMC that is called directly; `tracks[i]`: cell of UAV i by tick."""
 
     def __init__(self, world: World) -> None:
         config = world.config
-        N, who = config.team.size, config.team.pilot
+        N, who = config.team.size, config.team.controller
         self.world, self.station, self.records = world, Station(world, "run", learning=False), list[m.Record]()
-        table, observer = TrackTable(N, config.training.ticks), Observer(world)
-        planner = PlannerDecider(world, who)
+        table, observer = TrackTable(N, config.training.ticks), ObservationBuilder(world)
+        planner = PlannerController(world, who)
         pilots = [
             Pilot(world, i, 1, TableTracks(table, i), observer, lambda _: planner, planner) for i in range(N)
         ]  # fmt: skip
@@ -83,5 +83,5 @@ def world_of() -> Callable[..., World]:
 
 
 @pytest.fixture(scope="session")
-def flown() -> Callable[[World], Flown]:
-    return Flown
+def flown() -> Callable[[World], RunData]:
+    return RunData

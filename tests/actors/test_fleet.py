@@ -27,7 +27,7 @@ def test_the_laws_of_flight(
     """No two UAVs share a cell (eq. 1), none leaves the grid or enters an obstacle, none flies farther than a cell."""
     road_map: RoadMap = request.getfixturevalue(where)
     T = 40 if size < 30 else 15
-    values = {"team.size": size, "team.pilot": f"planner:{planner}", "training.ticks": T, "scenario": scenario}
+    values = {"team.size": size, "team.controller": f"planner:{planner}", "training.ticks": T, "scenario": scenario}
     world = world_of({**values, "training.episodes": 1, "comms.phase": "staggered"}, road_map)
     mission = flown(world)
     assert mission.fleet.idle and mission.station.phase == "done"
@@ -43,14 +43,14 @@ def test_the_laws_of_flight(
 def test_the_same_settings_fly_the_same_mission(
     flown: Callable[[World], Any], world_of: Callable[..., World], town: RoadMap
 ) -> None:
-    values = {"team.size": 5, "team.pilot": "planner:greedy", "training.ticks": 60, "training.episodes": 1}
+    values = {"team.size": 5, "team.controller": "planner:greedy", "training.ticks": 60, "training.episodes": 1}
     first, again = (flown(world_of(values, town)).tracks for _ in range(2))
     other = flown(world_of({**values, "training.seed": 2}, town)).tracks
     assert first == again != other
 
 
 def test_every_episode_is_flown(flown: Callable[[World], Any], world_of: Callable[..., World], town: RoadMap) -> None:
-    values = {"team.size": 4, "team.pilot": "planner:random-road", "training.ticks": 15, "training.episodes": 4}
+    values = {"team.size": 4, "team.controller": "planner:random-road", "training.ticks": 15, "training.episodes": 4}
     mission = flown(world_of(values, town))
     assert mission.station.episodes == 4
     for e in range(1, 5):
@@ -64,6 +64,11 @@ def test_greedy_beats_random_flight(
     """A planner that looks at its map keeps the city better known than one that does not."""
     mean = {}
     for planner in ("random", "random-road", "greedy"):
-        values = {"team.size": 5, "team.pilot": f"planner:{planner}", "training.ticks": 300, "training.episodes": 1}
+        values = {
+            "team.size": 5,
+            "team.controller": f"planner:{planner}",
+            "training.ticks": 300,
+            "training.episodes": 1,
+        }
         mean[planner] = flown(world_of(values, toronto)).station.episode_uncertainty
     assert mean["greedy"] < mean["random-road"] < mean["random"]

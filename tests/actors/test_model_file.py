@@ -16,10 +16,10 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from actors.modelfile import reason
-from actors.planners import Sight
-from actors.policy import NetworkDecider, open_model
+from actors.planners import LocalState
+from actors.policy import PolicyController, open_model
 from tmc.kernel.config import build
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import INPUT, KEY, OUTPUT, FlightError, PolicyError, card_for
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
@@ -65,22 +65,22 @@ def linear(weights: np.ndarray[Any, Any] | None = None, before: tuple[Any, ...] 
     return {"nodes": nodes, "weights": {"w": table.astype(np.float32)}}
 
 
-def decider(model: bytes, world: World) -> NetworkDecider:
-    return NetworkDecider(model, world.config, Observer(world))
+def controller(model: bytes, world: World) -> PolicyController:
+    return PolicyController(model, world.config, ObservationBuilder(world))
 
 
 def refused(model: bytes, world: World) -> str:
     with pytest.raises(PolicyError) as error:
-        decider(model, world)
+        controller(model, world)
     text = str(error.value)
     assert text.isprintable() and 20 < len(text) < 300
     return text
 
 
-def sight(world: World, peers: list[int] | None = None, u: float = 0.5) -> Sight:
+def state(world: World, peers: list[int] | None = None, u: float = 0.5) -> LocalState:
     cell = int(world.start_cells[0])
     values = np.full(world.law.cells.size, u)
-    return Sight(0, cell, cell, peers or [], values, list(range(9)), 0.0)
+    return LocalState(0, cell, cell, peers or [], values, list(range(9)), 0.0)
 
 
 # What it declares
@@ -89,7 +89,7 @@ def sight(world: World, peers: list[int] | None = None, u: float = 0.5) -> Sight
 def test_the_policy_of_these_tests_flies(world: World) -> None:
     table = np.zeros((27, 9))
     table[:, 6] = 1.0
-    assert decider(model_of(world, **linear(table)), world).choose(sight(world)) == 6
+    assert controller(model_of(world, **linear(table)), world).choose(state(world)) == 6
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_what_a_model_declares(world: World, change: dict[str, Any], words: str 
     change = dict(change)
     model = model_of(world, **linear(change.pop("table", None)), **change)
     if words is None:
-        decider(model, world).choose(sight(world))
+        controller(model, world).choose(state(world))
     else:
         assert words in refused(model, world)
 
@@ -151,7 +151,7 @@ def test_another_number_of_values_is_refused_declared_or_not(world: World) -> No
 def test_what_a_model_gives_besides_is_not_asked_for(world: World) -> None:
     made = onnx.load_from_string(model_of(world, **linear()))
     made.graph.output.append(helper.make_tensor_value_info("flat", FLOAT, ["batch", 27]))
-    decider(made.SerializeToString(), world).choose(sight(world))
+    controller(made.SerializeToString(), world).choose(state(world))
 
 
 def test_a_policy_that_draws_at_random_is_refused(world: World) -> None:
@@ -163,7 +163,7 @@ def test_a_policy_that_does_not_look_flies(world: World) -> None:
     """Its values are there before it is asked; they must reach us all the same."""
     values = np.arange(9, dtype=np.float32)[None]
     nodes = [helper.make_node("Constant", [], [OUTPUT], value=numpy_helper.from_array(values))]
-    assert decider(model_of(world, nodes, gives=(1, 9)), world).choose(sight(world)) == 8
+    assert controller(model_of(world, nodes, gives=(1, 9)), world).choose(state(world)) == 8
 
 
 # What it gives
@@ -181,21 +181,21 @@ def test_a_value_that_is_not_finite_stops_the_flight(world: World, bad: float, a
     values = np.arange(9, dtype=np.float32)[None]
     values[0, action] = bad
     nodes = [helper.make_node("Constant", [], [OUTPUT], value=numpy_helper.from_array(values))]
-    flying = decider(model_of(world, nodes, gives=(1, 9)), world)
+    flying = controller(model_of(world, nodes, gives=(1, 9)), world)
     with pytest.raises(FlightError, match=r"gave values that are not finite \(.*\b(nan|inf)\b.*\)"):
-        flying.choose(sight(world))
+        flying.choose(state(world))
     with pytest.raises(FlightError, match="not finite"):
-        flying.worth(sight(world), 3)
+        flying.q_of(state(world), 3)
 
 
 def test_values_whose_sum_is_beyond_float32_are_finite(world: World) -> None:
     values = np.full((1, 9), 3e38, np.float32)
     nodes = [helper.make_node("Constant", [], [OUTPUT], value=numpy_helper.from_array(values))]
-    assert decider(model_of(world, nodes, gives=(1, 9)), world).choose(sight(world)) == 0
+    assert controller(model_of(world, nodes, gives=(1, 9)), world).choose(state(world)) == 0
 
 
 def test_a_policy_that_fails_only_on_what_it_sees_is_stopped_there(world: World) -> None:
-    """log(1.25 - sum of P): a number with the UAV alone in sight (1.0), none with a peer beside it (1.5)."""
+    """log(1.25 - sum of P): a number with the UAV alone in state (1.0), none with a peer beside it (1.5)."""
     table = np.ones((1, 9))
     before = (
         *only_positions(),
@@ -208,12 +208,12 @@ def test_a_policy_that_fails_only_on_what_it_sees_is_stopped_there(world: World)
         "axes": np.array([1, 2, 3]), "limit": np.array(1.25, np.float32),
         "from": np.array([0]), "to": np.array([1]), "along": np.array([1]),
     }  # fmt: skip
-    flying = decider(model_of(world, **made), world)
-    assert flying.choose(sight(world)) == 0
+    flying = controller(model_of(world, **made), world)
+    assert flying.choose(state(world)) == 0
     peer = next(k for k in world.grid.target_lists[int(world.start_cells[0])][:8] if k >= 0)
     with pytest.raises(FlightError, match="gave values that are not finite"):
-        flying.choose(sight(world, [peer]))
-    assert flying.choose(sight(world)) == 0
+        flying.choose(state(world, [peer]))
+    assert flying.choose(state(world)) == 0
 
 
 def test_a_policy_that_fails_only_on_what_it_never_sees_flies(world: World) -> None:
@@ -226,7 +226,7 @@ def test_a_policy_that_fails_only_on_what_it_never_sees_flies(world: World) -> N
     model = model_of(world, **made)
     blank = ort.InferenceSession(model).run(None, {INPUT: np.zeros((1, *SHAPE), np.float32)})[0]
     assert np.isnan(blank).all()
-    assert decider(model, world).choose(sight(world)) == 5
+    assert controller(model, world).choose(state(world)) == 5
 
 
 def test_a_model_that_cannot_be_run_on_what_it_sees(world: World) -> None:
@@ -240,10 +240,10 @@ def test_a_model_that_cannot_be_run_on_what_it_sees(world: World) -> None:
     ]
     weights = {"from": np.array([2]), "to": np.array([3]), "along": np.array([1]), "two": np.array(2, np.float32),
                "table": np.arange(18, dtype=np.float32).reshape(2, 9)}  # fmt: skip
-    flying = decider(model_of(world, nodes, weights=weights), world)
-    assert flying.choose(sight(world, u=0.5)) == 8
+    flying = controller(model_of(world, nodes, weights=weights), world)
+    assert flying.choose(state(world, u=0.5)) == 8
     with pytest.raises(FlightError, match=r"could not be run \(.*row.*\)|could not be run \(.*bounds.*\)"):
-        flying.choose(sight(world, u=1.0))
+        flying.choose(state(world, u=1.0))
 
 
 # What else a file may be
@@ -277,12 +277,12 @@ FILES = [
 @pytest.mark.parametrize(("data", "words"), FILES, ids=[words[:24] for _, words in FILES])
 def test_a_file_that_is_something_else_is_named(world: World, data: bytes, words: str) -> None:
     with pytest.raises(PolicyError, match=words):
-        decider(data, world)
+        controller(data, world)
 
 
 def test_a_file_that_no_message_takes_is_refused(world: World) -> None:
     with pytest.raises(PolicyError, match=r"it has 67,108,865 bytes, and a policy may have 67,108,864"):
-        decider(bytes(2**26 + 1), world)
+        controller(bytes(2**26 + 1), world)
 
 
 def test_weights_in_another_file_are_refused_though_it_is_there(

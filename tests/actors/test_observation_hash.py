@@ -9,30 +9,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.observation_hash import Witness, digest
-from actors.planners import Sight, Valued
-from tmc.kernel.observation import Observer
+from actors.observation_hash import ObservationHasher, digest
+from actors.planners import LocalState, QController
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 from tmc.wire.messages import EMPTY, Record
 
 
 @pytest.fixture(scope="module")
-def observer(world_of: Callable[..., World], town: RoadMap) -> Observer:
-    return Observer(world_of({"observation.view": "ego", "observation.radius": 3}, town))
+def observer(world_of: Callable[..., World], town: RoadMap) -> ObservationBuilder:
+    return ObservationBuilder(world_of({"observation.view": "ego", "observation.radius": 3}, town))
 
 
 @pytest.fixture(scope="module")
-def sight(world_of: Callable[..., World], town: RoadMap) -> Sight:
+def state(world_of: Callable[..., World], town: RoadMap) -> LocalState:
     roads = world_of({}, town).law.cells.size
-    return Sight(7, 30, 29, [31], np.linspace(0, 0.9, roads), [0, 1, 3, 8], 0.5)
+    return LocalState(7, 30, 29, [31], np.linspace(0, 0.9, roads), [0, 1, 3, 8], 0.5)
 
 
 class North:
-    def choose(self, sight: Sight) -> int:
+    def choose(self, state: LocalState) -> int:
         return 0
 
-    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+    def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
         return float(action), 9.0
 
 
@@ -42,41 +42,41 @@ def record(first: int, tick: int) -> Record:
     return Record(2, 1, 0, 1, first, tick, 0, 0, cells, small, small, np.zeros(moves, "<f4"), EMPTY, EMPTY)
 
 
-def test_the_hash_is_what_the_document_says(observer: Observer, sight: Sight) -> None:
-    image = observer.observe(sight.cell, sight.peers, sight.u)
+def test_the_hash_is_what_the_document_says(observer: ObservationBuilder, state: LocalState) -> None:
+    image = observer.observe(state.cell, state.peers, state.u)
     assert image.dtype == np.float32
     whole = hashlib.blake2b(image.tobytes() + bytes([0, 1, 3, 8]), digest_size=8).digest()
-    assert digest(observer, sight) == int.from_bytes(whole, "little")
+    assert digest(observer, state) == int.from_bytes(whole, "little")
 
 
-def test_it_changes_with_all_that_is_seen(observer: Observer, sight: Sight) -> None:
-    u = sight.u.copy()
-    u[np.flatnonzero(observer.observe(sight.cell, [], sight.u)[2].ravel()).size // 2] += 1e-3
-    changed = [replace(sight, cell=42), replace(sight, peers=[]), replace(sight, allowed=[0, 1, 3])]
-    changed += [replace(sight, u=sight.u * 0.99)]
-    assert len({digest(observer, s) for s in (sight, *changed)}) == 5
+def test_it_changes_with_all_that_is_seen(observer: ObservationBuilder, state: LocalState) -> None:
+    u = state.u.copy()
+    u[np.flatnonzero(observer.observe(state.cell, [], state.u)[2].ravel()).size // 2] += 1e-3
+    changed = [replace(state, cell=42), replace(state, peers=[]), replace(state, allowed=[0, 1, 3])]
+    changed += [replace(state, u=state.u * 0.99)]
+    assert len({digest(observer, s) for s in (state, *changed)}) == 5
 
 
-def test_it_does_not_change_with_what_is_no_observation(observer: Observer, sight: Sight) -> None:
-    same = [replace(sight, tick=8), replace(sight, previous=30), replace(sight, draw=0.1)]
-    assert len({digest(observer, s) for s in (sight, *same)}) == 1
+def test_it_does_not_change_with_what_is_no_observation(observer: ObservationBuilder, state: LocalState) -> None:
+    same = [replace(state, tick=8), replace(state, previous=30), replace(state, draw=0.1)]
+    assert len({digest(observer, s) for s in (state, *same)}) == 1
 
 
-def test_one_hash_a_move_and_none_where_chance_chose(observer: Observer, sight: Sight) -> None:
-    witness = Witness(observer)
-    decider = witness.watch(North())
+def test_one_hash_a_move_and_none_where_chance_chose(observer: ObservationBuilder, state: LocalState) -> None:
+    hasher = ObservationHasher(observer)
+    controller = hasher.watch(North())
     for tick in (0, 1, 3):  # at tick 2 exploration chose
-        assert decider.choose(replace(sight, tick=tick)) == 0
-    seen = digest(observer, sight)
-    said = witness.testify(record(0, 4))
+        assert controller.choose(replace(state, tick=tick)) == 0
+    seen = digest(observer, state)
+    said = hasher.hashes_for(record(0, 4))
     assert (said.uav, said.episode, said.first, said.tick) == (2, 1, 0, 4)
     assert said.hashes == [seen, seen, 0, seen]
-    decider.choose(replace(sight, tick=4))
-    assert witness.testify(record(5, 6)).hashes == [seen, 0]
+    controller.choose(replace(state, tick=4))
+    assert hasher.hashes_for(record(5, 6)).hashes == [seen, 0]
 
 
-def test_what_a_policy_says_of_its_moves_is_not_a_decision(observer: Observer, sight: Sight) -> None:
-    witness = Witness(observer)
-    watched = witness.watch(North())
-    assert isinstance(watched, Valued) and watched.worth(sight, 4) == (4.0, 9.0)
-    assert witness.testify(record(8, 8)).hashes == [0]
+def test_what_a_policy_says_of_its_moves_is_not_a_decision(observer: ObservationBuilder, state: LocalState) -> None:
+    hasher = ObservationHasher(observer)
+    watched = hasher.watch(North())
+    assert isinstance(watched, QController) and watched.q_of(state, 4) == (4.0, 9.0)
+    assert hasher.hashes_for(record(8, 8)).hashes == [0]

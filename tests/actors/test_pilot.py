@@ -10,10 +10,10 @@ import pytest
 
 from actors.airspace import Waiting
 from actors.pilot import Phase, Pilot
-from actors.planners import Decider, Sight
+from actors.planners import Controller, LocalState
 from actors.tracks import TableTracks, TrackTable
 from tmc.kernel.draws import Stream, uniforms
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import FlightError, PolicyError
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
@@ -27,10 +27,10 @@ class Script:
     """Does as it is told, and notes what it saw."""
 
     def __init__(self, actions: list[int]) -> None:
-        self.actions, self.sights = iter(actions), list[Sight]()
+        self.actions, self.sights = iter(actions), list[LocalState]()
 
-    def choose(self, sight: Sight) -> int:
-        self.sights.append(sight)
+    def choose(self, state: LocalState) -> int:
+        self.sights.append(state)
         return next(self.actions)
 
 
@@ -41,7 +41,7 @@ class Team:
         self.world, self.T = world, world.config.training.ticks
         self.episode = next(e for e in range(1, 20_000) if world.starts(e) == starts)
         self.scripts = [Script(actions) for actions in scripts]
-        table, observer = TrackTable(len(starts), self.T), Observer(world)
+        table, observer = TrackTable(len(starts), self.T), ObservationBuilder(world)
         self.pilots = [
             Pilot(world, i, 1, TableTracks(table, i), observer, Policies(), script)
             for i, script in enumerate(self.scripts)
@@ -100,7 +100,7 @@ def test_a_flight_taken_up_at_its_end_asks_nobody_where_it_was(world_of: Callabl
     """The TMC has all of it; the peers may have begun the next episode, and answer for that one only."""
     world = world_of({"team.size": 2, "training.ticks": 3, "comms.period": 1000}, STREET)
     episode = next(e for e in range(1, 1000) if world.starts(e) == [0, 1])
-    pilot = Pilot(world, 0, 2, TableTracks(TrackTable(2, 3), 0), Observer(world), Policies(), Script([]))
+    pilot = Pilot(world, 0, 2, TableTracks(TrackTable(2, 3), 0), ObservationBuilder(world), Policies(), Script([]))
     pilot.begin(begin(world, episode, 0, 0, 0, 0, shipped=3, sequence=2))
     assert pilot.advance() is None and pilot.phase is Phase.IDLE
     pilot.on_map(answer(world, episode, 3))
@@ -249,7 +249,7 @@ class Policies:
     def __init__(self) -> None:
         self.made: list[bytes] = []
 
-    def __call__(self, model: bytes) -> Decider:
+    def __call__(self, model: bytes) -> Controller:
         self.made.append(model)
         return Script([STAY] * 1000)
 
@@ -257,7 +257,7 @@ class Policies:
 def learning(world_of: Callable[..., World], **values: Any) -> tuple[Pilot, Policies, World]:
     world = world_of({"team.size": 1, "comms.period": 10, "training.ticks": 500, **values}, "#####\n#####\n#####")
     policies = Policies()
-    pilot = Pilot(world, 0, 1, TableTracks(TrackTable(1, 500), 0), Observer(world), policies)
+    pilot = Pilot(world, 0, 1, TableTracks(TrackTable(1, 500), 0), ObservationBuilder(world), policies)
     return pilot, policies, world
 
 
@@ -309,16 +309,16 @@ class Worthy(Script):
 
     best = 8.0
 
-    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
+    def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
         return float(action), self.best
 
 
 def test_each_move_is_told_with_its_worth_where_priorities_are_on(world_of: Callable[..., World]) -> None:
     """Whether exploration chose it or not."""
-    values = {"exploration.start": 0.5, "exploration.end": 0.5, "comms.period": 30, "replay.priority": 0.6}
+    values = {"exploration.start": 0.5, "exploration.end": 0.5, "comms.period": 30, "replay.priority_exponent": 0.6}
     pilot, _, world = learning(world_of, **values)
     policy = Worthy([STAY] * 1000)
-    pilot._make_decider = lambda _: policy
+    pilot._make_controller = lambda _: policy
     pilot.begin(begin(world, 7, world.starts(7)[0], policy=1))
     pilot.on_policy(Policy(1, b""))
     record = pilot.advance()
@@ -336,22 +336,22 @@ def test_a_policy_that_fails_in_flight_names_uav_tick_and_policy(
     world_of: Callable[..., World], explores: float
 ) -> None:
     """Also where exploration chooses and the policy only says what that is worth."""
-    values = {"exploration.start": explores, "exploration.end": explores, "replay.priority": 0.6}
+    values = {"exploration.start": explores, "exploration.end": explores, "replay.priority_exponent": 0.6}
     pilot, _, world = learning(world_of, **values)
 
     class Failing(Worthy):
-        def choose(self, sight: Any) -> int:
-            return self.fail(sight) or super().choose(sight)
+        def choose(self, state: Any) -> int:
+            return self.fail(state) or super().choose(state)
 
-        def worth(self, sight: Any, action: int) -> tuple[float, float]:
-            return (self.fail(sight), 0.0)
+        def q_of(self, state: Any, action: int) -> tuple[float, float]:
+            return (self.fail(state), 0.0)
 
-        def fail(self, sight: Any) -> int:
-            if sight.tick == 3:
+        def fail(self, state: Any) -> int:
+            if state.tick == 3:
                 raise FlightError("gave values that are not finite (nan)")
             return 0
 
-    pilot._make_decider = lambda _: Failing([STAY] * 1000)
+    pilot._make_controller = lambda _: Failing([STAY] * 1000)
     pilot.begin(begin(world, 7, world.starts(7)[0], policy=5))
     pilot.on_policy(Policy(5, b""))
     pilot.advance()
@@ -367,7 +367,7 @@ def test_a_policy_that_cannot_fly_is_named_where_it_is_refused(world_of: Callabl
     def refuse(_: bytes) -> Any:
         raise PolicyError("the file is empty: copy it again")
 
-    pilot._make_decider = refuse
+    pilot._make_controller = refuse
     pilot.begin(begin(world, 7, world.starts(7)[0], policy=5))
     with pytest.raises(PolicyError, match="UAV 0 cannot fly policy 5: the file is empty"):
         pilot.on_policy(Policy(5, b""))

@@ -11,13 +11,13 @@ import onnx
 import pytest
 import torch
 
-from actors.planners import Sight
-from actors.policy import NetworkDecider, read_card
+from actors.planners import LocalState
+from actors.policy import PolicyController, read_card
 from learner import qnet
 from learner.export import to_onnx
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import Grid
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import KEY, FlightError, PolicyCard, PolicyError, card_for, view_shape
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
@@ -52,16 +52,16 @@ def world(town: RoadMap) -> World:
 def refused(model: bytes, world: World) -> str:
     """The one sentence of the refusal."""
     with pytest.raises(PolicyError) as error:
-        NetworkDecider(model, world.config, Observer(world))
+        PolicyController(model, world.config, ObservationBuilder(world))
     text = str(error.value)
     assert "\n" not in text and 20 < len(text) < 200
     assert error.value.__cause__ is None and error.value.__suppress_context__ | (error.value.__context__ is None)
     return text
 
 
-def sight(world: World, cell: int, peers: list[int], seed: int = 0) -> Sight:
+def state(world: World, cell: int, peers: list[int], seed: int = 0) -> LocalState:
     u = np.random.Generator(np.random.Philox(seed)).random(world.law.cells.size)
-    return Sight(0, cell, cell, peers, u, Observer(world).allowed(cell, peers), 0.0)
+    return LocalState(0, cell, cell, peers, u, ObservationBuilder(world).allowed(cell, peers), 0.0)
 
 
 @pytest.mark.parametrize("mask", [False, True])
@@ -72,48 +72,48 @@ def test_it_chooses_what_the_network_values_most(town: RoadMap, mask: bool, view
     net = qnet.build(config, view_shape(config, world.grid))
     with torch.no_grad():
         net.out.weight.normal_(generator=torch.Generator().manual_seed(5))
-    observer = Observer(world)
-    decider = NetworkDecider(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
+    observer = ObservationBuilder(world)
+    controller = PolicyController(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
     chosen = set()
     for seed, cell in enumerate(world.start_cells.tolist()):
         peers = [k for k in world.grid.target_lists[cell][:8] if k >= 0 and not town.blocked[k]][: seed % 4]
-        s = sight(world, cell, peers, seed)
+        s = state(world, cell, peers, seed)
         o = observer.observe(cell, peers, s.u)
         q = net(torch.tensor(o[None])).detach().numpy()[0]
         may = s.allowed if mask else range(9)
-        assert decider.choose(s) in [a for a in may if q[a] >= max(q[b] for b in may) - 1e-5]  # but for rounding
-        chosen.add(decider.choose(s))
+        assert controller.choose(s) in [a for a in may if q[a] >= max(q[b] for b in may) - 1e-5]  # but for rounding
+        chosen.add(controller.choose(s))
     assert len(chosen) > 1
 
 
 @pytest.mark.parametrize("mask", [False, True])
 def test_it_knows_what_actions_are_worth(town: RoadMap, mask: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of what it chose by and of what it did not look at yet; the network runs once a sight."""
+    """Of what it chose by and of what it did not look at yet; the network runs once a state."""
     config = build({**TINY, "exploration.mask_blocked": mask})
     world = World(config, town)
     net = qnet.build(config, view_shape(config, world.grid))
     with torch.no_grad():
         net.out.weight.normal_(generator=torch.Generator().manual_seed(5))
-    observer, runs = Observer(world), [0]
-    decider = NetworkDecider(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
-    q_values = decider.q_values
+    observer, runs = ObservationBuilder(world), [0]
+    controller = PolicyController(to_onnx(net, card_for(config, world.grid, 1, 0)), config, observer)
+    q_values = controller.q_values
 
     def counted() -> Any:
         runs[0] += 1
         return q_values()
 
-    monkeypatch.setattr(decider, "q_values", counted)
+    monkeypatch.setattr(controller, "q_values", counted)
     cells = world.start_cells.tolist()[:12]
     for seed, cell in enumerate(cells):
-        s = sight(world, cell, [k for k in world.grid.target_lists[cell][:2] if k >= 0], seed)
+        s = state(world, cell, [k for k in world.grid.target_lists[cell][:2] if k >= 0], seed)
         o = observer.observe(cell, s.peers, s.u)
         q = net(torch.tensor(o[None])).detach().numpy()[0]
         best = max(q[a] for a in (s.allowed if mask else range(9)))
-        chosen = decider.choose(s) if seed % 2 else None  # it does not look where exploration chose
+        chosen = controller.choose(s) if seed % 2 else None  # it does not look where exploration chose
         for action in range(9):
-            assert decider.worth(s, action) == (pytest.approx(q[action], abs=1e-5), pytest.approx(best, abs=1e-5))
+            assert controller.q_of(s, action) == (pytest.approx(q[action], abs=1e-5), pytest.approx(best, abs=1e-5))
         if chosen is not None:
-            assert decider.worth(s, chosen)[0] == decider.worth(s, chosen)[1]
+            assert controller.q_of(s, chosen)[0] == controller.q_of(s, chosen)[1]
     assert runs == [len(cells)]
 
 
@@ -128,11 +128,11 @@ def test_the_mask_takes_the_next_best(town: RoadMap, favourite: int) -> None:
     for mask in (False, True):
         config = build({**TINY, "exploration.mask_blocked": mask})
         world = World(config, town)
-        decider = NetworkDecider(policy(config, world.grid, likes), config, Observer(world))
-        s = sight(world, 0, [1])
+        controller = PolicyController(policy(config, world.grid, likes), config, ObservationBuilder(world))
+        s = state(world, 0, [1])
         assert s.allowed == [1, 7, 8]
         expected = favourite if not mask or favourite in s.allowed else 1
-        assert decider.choose(s) == expected
+        assert controller.choose(s) == expected
 
 
 def test_the_card_comes_back(world: World) -> None:
@@ -183,9 +183,9 @@ def test_weights_that_are_not_finite_do_not_fly(world: World, name: str, bad: fl
     def spoil(net: Any) -> None:
         dict(net.named_parameters())[name].reshape(-1)[0] = bad
 
-    decider = NetworkDecider(policy(world.config, world.grid, spoil), world.config, Observer(world))
+    controller = PolicyController(policy(world.config, world.grid, spoil), world.config, ObservationBuilder(world))
     with pytest.raises(FlightError, match="gave values that are not finite"):
-        decider.choose(sight(world, int(world.start_cells[0]), []))
+        controller.choose(state(world, int(world.start_cells[0]), []))
 
 
 @pytest.mark.parametrize("junk", [b"", b"garbage", b"\x00" * 100, b"\x08\x09\x12", bytes(range(256)) * 20])

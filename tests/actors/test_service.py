@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from actors.service import Left, Service, another_mission
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
 from tmc.record.writer import LogWriter
@@ -30,12 +30,12 @@ def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path, short: 
     try:
         with ThreadPoolExecutor(1) as other:
             joining = other.submit(service._join, lambda: False)
-            assert tmc.poll(1000 * PATIENCE)
+            assert tmc.poll(1000 * PATIENCE_S)
             frames = sockets.receive(tmc)
             assert frames is not None
             sockets.send(tmc, m.End("the mission is over"), bytes(frames[0]))
             with pytest.raises(Left, match="over") as left:
-                joining.result(PATIENCE)
+                joining.result(PATIENCE_S)
             assert left.value.code == process.DONE
     finally:
         service.close()
@@ -44,7 +44,7 @@ def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path, short: 
 
 def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path: Path, short: Path) -> None:
     """UAV 0 waits for UAV 1, of which nothing comes, while beacons of UAV 2 come in all the time."""
-    world = World(build({"team.size": 3, "team.pilot": "planner:greedy", "training.ticks": 100}))
+    world = World(build({"team.size": 3, "team.controller": "planner:greedy", "training.ticks": 100}))
     numbered = ((e, world.starts(e)) for e in range(1, 5000))
     episode, starts = next((e, s) for e, s in numbered if world.grid.chebyshev(s[0], s[1]) <= 2)
     endpoint, context = f"ipc://{short}/sync", zmq.Context[Any]()
@@ -56,7 +56,7 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
     said: Counter[str] = Counter()
     try:
         with ThreadPoolExecutor(1) as other:
-            flying, until = other.submit(service.fly, over.is_set), time.monotonic() + PATIENCE
+            flying, until = other.submit(service.fly, over.is_set), time.monotonic() + PATIENCE_S
             while (said["ask"] < 5 or said["Alive"] < 2) and time.monotonic() < until:
                 if said["Hello"]:
                     sockets.send(tmc, beacon, b"uav-000")
@@ -73,7 +73,7 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
                     sockets.send(tmc, m.Map(episode, 0, 1, 0, 0, 0, zeros, m.EMPTY), bytes(identity))
             over.set()
             with pytest.raises(Left):
-                flying.result(PATIENCE)
+                flying.result(PATIENCE_S)
         assert said["ask"] >= 5 and said["Alive"] >= 2, said
     finally:
         service.close()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from actors.tracks import TableTracks, TrackTable, create_table, open_table
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 
 
 def test_what_is_published_is_read_and_nothing_else() -> None:
@@ -91,7 +91,7 @@ def test_two_processes_share_a_file(tmp_path: Path) -> None:
     mine.begin(1, [0, 1])
     process = multiprocessing.get_context("spawn").Process(target=_publish, args=(path,))
     process.start()
-    process.join(PATIENCE)
+    process.join(PATIENCE_S)
     assert process.exitcode == 0
     assert mine.newest(1) == (3, 42) and mine.at(1, 3) == 42
 
@@ -111,11 +111,11 @@ def test_who_waits_is_woken_by_the_tick_that_it_waits_for(tmp_path: Path) -> Non
     mine.begin(1, [0, 1])
     process = multiprocessing.get_context("spawn").Process(target=_publish_slowly, args=(path,))
     process.start()
-    looks, give_up = 0, time.monotonic() + PATIENCE
+    looks, give_up = 0, time.monotonic() + PATIENCE_S
     while mine.newest(1)[0] < 5 and time.monotonic() < give_up:
         mine.wait(1, 5, 10.0)
         looks += 1
-    process.join(PATIENCE)
+    process.join(PATIENCE_S)
     assert mine.at(1, 5) == 45
     assert looks <= 6, "woken by what is published, not by looking again and again"
 
@@ -127,8 +127,8 @@ def test_a_wait_for_what_is_there_or_never_comes_ends(tmp_path: Path) -> None:
         tracks.begin(1, [0, 1])
     peer.publish(3, 7)
     start = time.monotonic()
-    mine.wait(1, 3, 2 * PATIENCE)
-    assert time.monotonic() - start < PATIENCE
+    mine.wait(1, 3, 2 * PATIENCE_S)
+    assert time.monotonic() - start < PATIENCE_S
     mine.wait(1, 4, 0.01)
     assert mine.newest(1) == (3, 7)
 

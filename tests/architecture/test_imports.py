@@ -1,4 +1,6 @@
-"""Who may import whom: the contracts of pyproject.toml, and where the heavy and the networked packages may appear."""
+"""PolicySpec may import whom: the contracts of pyproject.toml, and where the heavy and the networked packages may
+appear.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("actors", "learner", "tmc", "deploy")
@@ -53,7 +55,7 @@ def imported(path: Path) -> Iterator[str]:
 def run(code: str) -> str:
     """What `code` prints in a process of its own."""
     command = [sys.executable, "-P", "-c", code]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert result.returncode == 0, result.stderr
     return result.stdout.strip()
 
@@ -61,7 +63,7 @@ def run(code: str) -> str:
 def test_the_contracts_of_pyproject_hold() -> None:
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()"]
     result = subprocess.run(
-        [*command, "--no-cache", "--no-logo"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False
+        [*command, "--no-cache", "--no-logo"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert result.returncode == 0, result.stdout + result.stderr
 
@@ -98,7 +100,7 @@ def test_the_command_loads_nothing_heavy_before_a_command_is_chosen() -> None:
 @pytest.mark.parametrize("role", ["actors", "tmc"])
 def test_help_starts_no_network_library(role: str) -> None:
     command = [sys.executable, "-P", "-X", "importtime", "-m", role, "--help"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True)
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     names = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines() if line.startswith("import time:")}
     assert "tmc.kernel.config" in names
     assert not names & {"torch", "onnx", "onnxruntime", "safetensors", "matplotlib"}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"actors", "learner", "tmc", "deploy"}
@@ -22,7 +22,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     code = f"from hatchling.build import build_wheel; print(build_wheel({str(folder)!r}))"
     result = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False
+        [sys.executable, "-P", "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert result.returncode == 0, result.stderr
     return folder / result.stdout.split()[-1]
@@ -48,7 +48,7 @@ def overfly(installed: Path, where: Path, *args: str) -> subprocess.CompletedPro
     environment = os.environ | {"PYTHONPATH": str(installed)}
     command = [sys.executable, "-P", "-m", "deploy.cli", *args]
     return subprocess.run(
-        command, cwd=where, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+        command, cwd=where, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
 
 
@@ -97,6 +97,6 @@ def test_the_packages_come_from_the_wheel(installed: Path, tmp_path: Path) -> No
     code = "import actors, learner, tmc, deploy\nfor p in (actors, learner, tmc, deploy): print(p.__path__[0])"
     result = subprocess.run(
         [sys.executable, "-P", "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)},
-        capture_output=True, text=True, timeout=PATIENCE, check=True,
+        capture_output=True, text=True, timeout=PATIENCE_S, check=True,
     )  # fmt: skip
     assert {Path(p).parent for p in result.stdout.splitlines()} == {installed}

@@ -119,8 +119,8 @@ def test_the_limits() -> None:
 def test_the_example_endpoints() -> None:
     sync, feed = (row[1] for row in rows(section("Sockets and endpoints")))
     tcp, ipc = named(sync)
-    assert sockets.feed_endpoint(tcp) == named(feed)[0]
-    assert sockets.feed_endpoint(ipc) == ipc + named(feed)[1]
+    assert sockets.learner_endpoint(tcp) == named(feed)[0]
+    assert sockets.learner_endpoint(ipc) == ipc + named(feed)[1]
 
 
 @pytest.mark.parametrize("name", ["uav-000", "uav-12345", "learner", "observer-a-1"])

@@ -26,7 +26,7 @@ CASES = [
     (("run", "paper", "--scenario", "3"), "scenario = 3 is out of range"),
     (("run", "paper", "--set", "world.rates=lunar"), "lunar"),
     (("run", "paper", "--set", "network.kernel=20"), "network"),
-    (("run", "paper", "--set", "dqn.batch=50000"), "choose 25970 or less"),
+    (("run", "paper", "--set", "dqn.batch_size=50000"), "choose 25970 or less"),
     (("fly", "planner:astar"), "there is no planner"),
     (("fly", "nowhere.onnx"), "no policy file and no run folder"),
     (("evaluate", "planner:greedy", "--seeds", "0"), "--seeds"),

@@ -104,7 +104,7 @@ def test_a_file_that_is_no_policy_is_named(tmp_path: Path, capsys, monkeypatch) 
 
 
 @pytest.fixture
-def strange(tmp_path: Path) -> Iterator[dict[str, Path]]:
+def anomalies(tmp_path: Path) -> Iterator[dict[str, Path]]:
     """Paths that name no file; whoever opened some of them to read would wait for ever."""
     os.mkfifo(tmp_path / "pipe")
     with socket.socket(socket.AF_UNIX) as bound, contextlib.chdir(tmp_path):  # its name may not be long
@@ -113,16 +113,16 @@ def strange(tmp_path: Path) -> Iterator[dict[str, Path]]:
 
 
 COMMANDS = ("fly", "evaluate", "fly planner:greedy --map", "map show", "map export", "map check", "run --resume",
-            "analyze", "log info", "log cat", "log digest", "log check", "log recover", "log seal", "log merge",
+            "analyze", "log info", "log cat", "log digest", "log check", "log recover", "log compact", "log merge",
             "log replay")  # fmt: skip
 
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("kind", ["pipe", "socket", "device"])
-def test_what_is_no_file_is_refused_and_never_waited_for(strange, kind: str, capsys) -> None:
+def test_what_is_no_file_is_refused_and_never_waited_for(anomalies, kind: str, capsys) -> None:
     for command in COMMANDS:
-        said = one_sentence(main([*command.split(), str(strange[kind])]), capsys)
-        assert str(strange[kind]) in said, command
+        said = one_sentence(main([*command.split(), str(anomalies[kind])]), capsys)
+        assert str(anomalies[kind]) in said, command
         if command in ("fly", "evaluate", "map show", "fly planner:greedy --map"):
             assert f"it is a {kind}" in said
 
@@ -154,7 +154,7 @@ def test_a_pipe_in_a_run_folder_is_never_waited_for(flown: Path, tmp_path: Path,
         (["paper", "--episodes", "4"], "dqn.target_episodes = 5 is above training.episodes = 4"),
         *(
             (["paper", "--set", f"{key}={value}"], f"{key} = '{value}' is not of type float")
-            for key in ("world.alpha", "team.sensing_range", "reward.weight", "dqn.gamma", "journal.commit")
+            for key in ("world.alpha", "team.sensing_range", "reward.weight", "dqn.gamma", "journal.commit_interval")
             for value in ("nan", "inf", "-inf", "1e999")
         ),
         (["paper", "--set", "world.alpha=1e308"], "world.alpha = 1e+308 is out of range"),
@@ -172,10 +172,20 @@ def test_settings_that_cannot_work_are_refused_before_anything_starts(args, word
 
 
 def test_what_a_training_will_not_do_is_said_before_it_begins(tmp_path: Path) -> None:
-    small = ("--ticks", 40, "--episodes", 1, "--set", "replay.learn_start=30", "--set", "dqn.batch=8", "--no-pictures")
+    small = (
+        "--ticks",
+        40,
+        "--episodes",
+        1,
+        "--set",
+        "replay.learn_start=30",
+        "--set",
+        "dqn.batch_size=8",
+        "--no-pictures",
+    )
     done = here("run", "quick", "--lockstep", *small, "--out", "R", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "training.push_every = 100: UAVs fly the initial policy to the end" in done.stderr
+    assert "training.publish_every = 100: UAVs fly the initial policy to the end" in done.stderr
     assert "dqn.target_updates = 500: the target network stays as it is" in done.stderr
     quiet = here("fly", "planner:greedy", "--lockstep", "--ticks", 10, "--no-pictures", "--out", "F", cwd=tmp_path)
     assert "will not" not in quiet.stderr and "push_every" not in quiet.stderr

@@ -106,7 +106,16 @@ def test_without_the_extras_a_run_ends_before_it_begins_and_all_else_works(fake:
 
 def test_a_planner_trains_nothing_so_it_needs_no_learner(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lacks(monkeypatch, *LEARNERS)
-    options = ("--set", "team.pilot=planner:greedy", "--episodes", "1", "--ticks", "10", "--lockstep", "--no-pictures")
+    options = (
+        "--set",
+        "team.controller=planner:greedy",
+        "--episodes",
+        "1",
+        "--ticks",
+        "10",
+        "--lockstep",
+        "--no-pictures",
+    )
     assert here("run", "quick", *options, "--out", "R", cwd=place).returncode == 0
 
 

@@ -1,4 +1,4 @@
-"""`overfly log check | recover | seal` as a user calls them: what they print, and their exit codes."""
+"""`overfly log check | recover | compact` as a user calls them: what they print, and their exit codes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_cat_of_damage_prints_what_is_sound_and_says_that_it_is_not_all(
 
 def test_recover_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", "recover", str(run)]) == 0
-    assert "sound and finished" in capsys.readouterr().out
+    assert "intact and finished" in capsys.readouterr().out
     damage(run / "tmc.mcap")
     assert main(["log", "recover", str(run)]) == log_check.LOSS
     out = capsys.readouterr().out
@@ -94,7 +94,7 @@ def test_recover_of_a_file(run: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_seal(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "tmc.mcap").rename(run / "tmc.mcap.active")
-    assert main(["log", "seal", str(run)]) == 0
+    assert main(["log", "compact", str(run)]) == 0
     lines = capsys.readouterr().out.splitlines()
     said = lines[0].removeprefix(f"{run}/tmc.mcap: ")
     assert re.fullmatch(r"[\d,]+ bytes before, [\d,]+ after, [\d,]+ messages", said)
@@ -102,7 +102,7 @@ def test_seal(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", "check", str(run)]) == 0
     damage(run / "tmc.mcap")
     capsys.readouterr()
-    assert main(["log", "seal", str(run)]) == 1
+    assert main(["log", "compact", str(run)]) == 1
     assert "overfly log recover" in capsys.readouterr().err
 
 
@@ -111,11 +111,11 @@ def test_seal_of_a_run_that_is_alive(run: Path, capsys: pytest.CaptureFixture[st
     from tmc.kernel.config import Journal  # noqa: PLC0415
 
     with LogWriter(run / "learner.mcap", "learner", Journal(), config):
-        assert main(["log", "seal", str(run)]) == 1
+        assert main(["log", "compact", str(run)]) == 1
     assert "is being written by another process" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("view", ["check", "recover", "seal"])
+@pytest.mark.parametrize("view", ["check", "recover", "compact"])
 def test_no_run(view: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", view, str(tmp_path)]) == 2
     assert "holds no logs of a run" in capsys.readouterr().err

@@ -12,7 +12,7 @@ import pytest
 from tests.command import here, overfly
 
 OF_A_FILE = (("info",), ("cat",), ("merge",), ("recover",), ("recover", "--in-place"))
-OF_A_RUN = (("moves",), ("uncertainty",), ("events",), ("digest",), ("check",), ("seal",), ("replay",))
+OF_A_RUN = (("moves",), ("uncertainty",), ("events",), ("digest",), ("check",), ("compact",), ("replay",))
 
 
 def a_socket(path: Path) -> None:
@@ -73,7 +73,7 @@ def test_recover_of_a_run_goes_on_behind_a_log_that_is_none(tmp_path: Path) -> N
     (run / "learner.mcap.active").touch()
     done = here("log", "recover", run, cwd=tmp_path)
     assert done.returncode == 1  # in part: it is no mistake in the command
-    assert "learner.mcap.active is empty" in done.stderr and "tmc.mcap: sound and finished" in done.stdout
+    assert "learner.mcap.active is empty" in done.stderr and "tmc.mcap: intact and finished" in done.stdout
 
 
 @pytest.mark.parametrize("view", ["merge", "recover", "replay"])

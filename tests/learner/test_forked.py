@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 CODE = """
@@ -22,7 +22,7 @@ from learner.batching import Batch
 
 config = build({"training.threads": 2})
 world = World(config)
-shape = (config.dqn.batch, *view_shape(config, world.grid))
+shape = (config.dqn.batch_size, *view_shape(config, world.grid))
 
 def minibatch(n):
     rng, b = np.random.Generator(np.random.Philox(n)), shape[0]
@@ -53,7 +53,7 @@ def test_a_forked_learner_computes_the_same_bit_for_bit_on_its_threads() -> None
     env = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-P", "-c", CODE], cwd=ROOT, env=env,
-        capture_output=True, text=True, timeout=PATIENCE, check=False,
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     forked, started = done.stdout.split("\n")[:2]

@@ -17,7 +17,7 @@ from learner import dqn, qnet, reference, rounding
 from learner import trainer as trainer_module
 from learner.batching import Batch
 from learner.gradient import Gradient
-from learner.target_cache import Known
+from learner.target_cache import TargetValueCache
 from learner.trainer import Trainer
 from tests.learner.claims import assert_exact_within_rounding, batches_with_repeats
 from tmc.kernel.config import Config, build, flat
@@ -47,14 +47,16 @@ def test_so_it_is_with_the_networks_of_the_presets(preset: Config, minibatch_of:
 
 def stale_values(patch: pytest.MonkeyPatch) -> None:
     """What theta- said before it followed is taken for what it says now."""
-    patch.setattr(Known, "forget", lambda self: None)
+    patch.setattr(TargetValueCache, "forget", lambda self: None)
 
 
 def mixed_up_values(patch: pytest.MonkeyPatch) -> None:
     """Of two transitions that share a place, one gets the other's value."""
-    look_up = Known.look_up
+    look_up = TargetValueCache.look_up
     patch.setattr(
-        Known, "look_up", lambda self, index: (look_up(self, index)[0], self._number[index % len(self._number)] >= 0)
+        TargetValueCache,
+        "look_up",
+        lambda self, index: (look_up(self, index)[0], self._number[index % len(self._number)] >= 0),
     )
 
 
@@ -118,8 +120,8 @@ def plain_double(patch: pytest.MonkeyPatch) -> None:
 
 def half_precision(patch: pytest.MonkeyPatch) -> None:
     """Images are rounded to half precision: that is no float32."""
-    laid_out = trainer_module.laid_out
-    patch.setattr(trainer_module, "laid_out", lambda image: laid_out(np.float16(image).astype("<f4")))
+    as_channels_last = trainer_module.as_channels_last
+    patch.setattr(trainer_module, "as_channels_last", lambda image: as_channels_last(np.float16(image).astype("<f4")))
 
 
 WRONG: dict[Callable[[pytest.MonkeyPatch], None], dict[str, Any]] = {

@@ -11,7 +11,7 @@ import zmq
 
 from learner.checkpoint import CheckpointError
 from learner.service import WINDOW, ReplacedError, Service
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tmc.kernel.config import build, flat
 from tmc.kernel.world import World
 from tmc.wire import messages as m
@@ -57,7 +57,7 @@ def test_damaged_checkpoints_are_not_passed_over_for_new_weights(tmp_path: Path)
     (folder / "checkpoint-7.safetensors").write_bytes(b"not a checkpoint")
     service = Service(NOWHERE, tmp_path / "R")
     try:
-        with pytest.raises(CheckpointError, match=r"no checkpoint in .* is sound: remove them all"):
+        with pytest.raises(CheckpointError, match=r"no checkpoint in .* is intact: remove them all"):
             service.learn(lambda: False)
     finally:
         service.close()
@@ -66,7 +66,7 @@ def test_damaged_checkpoints_are_not_passed_over_for_new_weights(tmp_path: Path)
 def heard(tmc: zmq.Socket[Any], count: int) -> list[str]:
     """The kinds of the next `count` messages, after which nothing more comes."""
     said = []
-    while tmc.poll(200 if len(said) >= count else 1000 * PATIENCE):
+    while tmc.poll(200 if len(said) >= count else 1000 * PATIENCE_S):
         frames = sockets.receive(tmc)
         assert frames is not None
         said.append(type(decode(frames[1:])).__name__)
@@ -99,8 +99,8 @@ def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tm
 def test_a_learner_leaves_when_a_newer_one_has_its_place(tmp_path: Path) -> None:
     service = Service(NOWHERE, tmp_path / "R")
     try:
-        assert not service._obey(m.Error("fenced", "a newer process is the learner: leave", service.life + 1))
+        assert not service._obey(m.Error("fenced", "a newer process is the learner: leave", service.incarnation + 1))
         with pytest.raises(ReplacedError, match="a newer process is the learner"):
-            service._obey(m.Error("fenced", "a newer process is the learner: leave", service.life))
+            service._obey(m.Error("fenced", "a newer process is the learner: leave", service.incarnation))
     finally:
         service.close()

@@ -308,7 +308,7 @@ def test_transitions_without_numbers_are_refused(small, trainer_of, minibatch_of
 @pytest.mark.parametrize("threads", [1, 3])
 def test_weights_count_as_in_the_plain_equations(preset, trainer_of, minibatch_of, threads):
     """The gradient is that of the mean of weight times loss, whatever the threads that share it."""
-    config = build({**flat(preset), "replay.priority": 0.6, "training.threads": threads})
+    config = build({**flat(preset), "replay.priority_exponent": 0.6, "training.threads": threads})
     trainer = trainer_of(config)
     weight = np.array([1.0, 0.5, 0.1, 0.9, 0.3, 0.7], "<f4")
     batch = minibatch_of(config, weight=weight)
@@ -338,23 +338,23 @@ def test_weights_of_one_count_as_none(paper, trainer_of, minibatch_of):
 
 
 def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatch_of):
-    trainer = trainer_of(small({"replay.priority": 0.6}))
-    assert [x.size for x in trainer.judged()] == [0, 0]
+    trainer = trainer_of(small({"replay.priority_exponent": 0.6}))
+    assert [x.size for x in trainer.take_td_errors()] == [0, 0]
     batch = minibatch_of(trainer.config)
     metrics = trainer.update(batch)
-    index, errors = trainer.judged()
+    index, errors = trainer.take_td_errors()
     assert index.tolist() == batch.index.tolist() and (index.dtype, errors.dtype) == (np.int64, np.float32)
     assert errors.shape == (6,) and errors.mean() == pytest.approx(metrics.td_abs) and (errors >= 0).all()
-    assert [x.size for x in trainer.judged()] == [0, 0]
+    assert [x.size for x in trainer.take_td_errors()] == [0, 0]
     trainer.update(batch)
     trainer.forget()  # the numbers begin anew
-    assert [x.size for x in trainer.judged()] == [0, 0]
+    assert [x.size for x in trainer.take_td_errors()] == [0, 0]
 
 
 def test_without_priorities_no_errors_are_told(small, trainer_of, minibatch_of):
     trainer = trainer_of(small())
     trainer.update(minibatch_of(trainer.config))
-    assert [x.size for x in trainer.judged()] == [0, 0]
+    assert [x.size for x in trainer.take_td_errors()] == [0, 0]
 
 
 def test_weights_that_do_not_fit_are_refused(small, trainer_of, minibatch_of):

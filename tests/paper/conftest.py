@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from actors.fleet import Fleet
 from actors.pilot import Pilot
-from actors.planners import PlannerDecider, Sight
+from actors.planners import LocalState, PlannerController
 from actors.tracks import TableTracks, TrackTable
 from tmc.center.roster import uav_name
 from tmc.center.station import Station
@@ -33,7 +33,7 @@ X#..####
 
 
 @dataclass
-class Flown:
+class RunData:
     """What became of a mission; `cells[episode]`: shape (T + 1, N); `sights`: by (episode, uav, tick)."""
 
     world: World
@@ -42,7 +42,7 @@ class Flown:
     records: list[m.Record] = field(default_factory=list)
     maps: list[tuple[int, m.Map]] = field(default_factory=list)
     entries: list[Any] = field(default_factory=list)
-    sights: dict[tuple[int, int, int], Sight] = field(default_factory=dict)
+    sights: dict[tuple[int, int, int], LocalState] = field(default_factory=dict)
 
     @cached_property
     def cells(self) -> dict[int, NDArray[np.int64]]:
@@ -64,32 +64,32 @@ class Flown:
 
 
 class Watched:
-    """A planner whose every sight is kept."""
+    """A planner whose every state is kept."""
 
-    def __init__(self, flown: Flown, planner: str) -> None:
-        self._flown, self._planner = flown, PlannerDecider(flown.world, planner)
+    def __init__(self, flown: RunData, planner: str) -> None:
+        self._flown, self._planner = flown, PlannerController(flown.world, planner)
         self.pilot: Pilot | None = None
 
-    def choose(self, sight: Sight) -> int:
+    def choose(self, state: LocalState) -> int:
         assert self.pilot is not None
-        self._flown.sights[self.pilot.episode, self.pilot.uav, sight.tick] = sight
-        return self._planner.choose(sight)
+        self._flown.sights[self.pilot.episode, self.pilot.uav, state.tick] = state
+        return self._planner.choose(state)
 
 
 @pytest.fixture(scope="session")
-def fly() -> Callable[..., Flown]:
+def fly() -> Callable[..., RunData]:
     """Fly a mission on a small town; a team of pilot `policy` explores, and is greedy where it does not."""
 
-    def make(settings: dict[str, Any] | None = None) -> Flown:
-        small = {"team.size": 4, "team.pilot": "planner:random-road", "training.episodes": 2, "training.ticks": 37}
+    def make(settings: dict[str, Any] | None = None) -> RunData:
+        small = {"team.size": 4, "team.controller": "planner:random-road", "training.episodes": 2, "training.ticks": 37}
         world = World(build({**small, **(settings or {})}), parse_raster(TOWN))
         config = world.config
-        learned = config.team.pilot == "policy"
+        learned = config.team.controller == "policy"
         station = Station(world, "paper", learning=False, policy=b"a policy" if learned else None)
-        flown = Flown(world, station)
+        flown = RunData(world, station)
         table = TrackTable(config.team.size, config.training.ticks)
         for i in range(config.team.size):
-            watched = Watched(flown, "planner:greedy" if learned else config.team.pilot)
+            watched = Watched(flown, "planner:greedy" if learned else config.team.controller)
             planner = None if learned else watched
             tracks = TableTracks(table, i)
             watched.pilot = Pilot(world, i, 1, tracks, station.observer, lambda _, w=watched: w, planner)

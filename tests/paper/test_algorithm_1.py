@@ -38,14 +38,14 @@ def test_line_take_action_epsilon_greedy(fly: Fly) -> None:
     """The share of explored actions is epsilon, to four deviations; the others are the policy's."""
     for epsilon in (0.0, 0.3, 1.0):
         settings = {"exploration.start": epsilon, "exploration.end": epsilon, "training.ticks": 300}
-        flown = fly({"team.pilot": "policy", "training.episodes": 1, **settings})
+        flown = fly({"team.controller": "policy", "training.episodes": 1, **settings})
         steps, explored = 4 * 300, sum(pilot.explored for pilot in flown.pilots)
         assert abs(explored - epsilon * steps) <= 4 * math.sqrt(steps * epsilon * (1 - epsilon))
         assert len(flown.sights) == steps - explored
 
 
 def test_line_take_action_epsilon_is_annealed_over_the_episodes(fly: Fly) -> None:
-    flown = fly({"team.pilot": "policy", "training.episodes": 6})
+    flown = fly({"team.controller": "policy", "training.episodes": 6})
     chosen = [sum(e == episode for e, _, _ in flown.sights) for episode in range(1, 7)]
     assert chosen[0] < chosen[-1]
     assert chosen[-1] > 0.85 * 4 * 37
@@ -53,7 +53,7 @@ def test_line_take_action_epsilon_is_annealed_over_the_episodes(fly: Fly) -> Non
 
 def test_line_explored_actions_are_uniform_over_the_nine(fly: Fly) -> None:
     settings = {"exploration.start": 1.0, "exploration.end": 1.0, "training.ticks": 500, "training.episodes": 2}
-    flown = fly({"team.pilot": "policy", **settings})
+    flown = fly({"team.controller": "policy", **settings})
     actions = np.concatenate([record.actions for record in flown.records])
     expected = actions.size / 9
     assert np.abs(np.bincount(actions, minlength=9) - expected).max() < 4 * math.sqrt(expected)

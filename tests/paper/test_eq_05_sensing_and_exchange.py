@@ -17,20 +17,20 @@ def test_eq_05_neighbours_are_the_uavs_within_r_s(radius: float, fly: Fly) -> No
     """N_i(t) = {i' != i: |p_i(t) - p_i'(t)| <= r_s}, and nobody else's location is known."""
     flown = fly({"team.size": 8, "team.sensing_range": radius})
     cols, met = flown.world.grid.cols, 0
-    for (episode, uav, t), sight in flown.sights.items():
+    for (episode, uav, t), state in flown.sights.items():
         team = flown.cells[episode][t].tolist()
         others = [k for i, k in enumerate(team) if i != uav]
         near = [k for k in others if math.dist(divmod(k, cols), divmod(team[uav], cols)) <= radius]
-        assert sight.peers == near
+        assert state.peers == near
         met += len(near)
     assert met > 100
 
 
 def test_sec_2c_in_scenario_1_every_location_is_known(fly: Fly) -> None:
     flown = fly({"scenario": 1})
-    for (episode, uav, t), sight in flown.sights.items():
+    for (episode, uav, t), state in flown.sights.items():
         team = flown.cells[episode][t].tolist()
-        assert sight.peers == team[:uav] + team[uav + 1 :]
+        assert state.peers == team[:uav] + team[uav + 1 :]
 
 
 @pytest.mark.parametrize(("period", "phase"), [(10, "together"), (10, "staggered"), (1, "together"), (50, "together")])

@@ -38,7 +38,7 @@ def test_eq_06_falls_with_the_number_of_uavs(fly: Fly) -> None:
     for scenario in (1, 2):
         averages = []
         for n in (1, 4, 10):
-            settings = {"scenario": scenario, "team.size": n, "team.pilot": "planner:greedy", "world.alpha": 0.05}
+            settings = {"scenario": scenario, "team.size": n, "team.controller": "planner:greedy", "world.alpha": 0.05}
             flown = fly({**settings, "training.ticks": 60, "training.episodes": 1})
             averages.append(flown.station.episode_uncertainty)
         assert averages[0] > averages[1] > averages[2]

@@ -19,13 +19,13 @@ PILOTS = ["planner:random", "planner:random-road", "planner:greedy"]
 @pytest.mark.parametrize("scenario", [1, 2])
 def test_eq_01_no_two_uavs_share_a_cell(pilot: str, scenario: int, fly: Fly) -> None:
     """p_i1(t) != p_i2(t) for all t, in a town full of UAVs that do not care."""
-    flown = fly({"team.size": 12, "team.pilot": pilot, "scenario": scenario})
+    flown = fly({"team.size": 12, "team.controller": pilot, "scenario": scenario})
     for cells in flown.cells.values():
         assert all(len(set(now)) == 12 for now in cells.tolist())
 
 
 def test_sec_2a_no_uav_is_on_an_obstacle_or_moves_more_than_a_cell(fly: Fly) -> None:
-    flown = fly({"team.pilot": "planner:random"})
+    flown = fly({"team.controller": "planner:random"})
     grid, blocked = flown.world.grid, flown.world.map.blocked
     for cells in flown.cells.values():
         assert not blocked[cells].any()
@@ -36,7 +36,7 @@ def test_eq_02_uncertainty_is_one_where_an_event_is_active(fly: Fly) -> None:
     """Scenario I: every UAV's map is e_k(t), and so is what the TMC adds up."""
     flown = fly({"scenario": 1, "world.alpha": 0.1})
     world = flown.world
-    assert {u for sight in flown.sights.values() for u in sight.u.tolist()} == {0.0, 1.0}
+    assert {u for state in flown.sights.values() for u in state.u.tolist()} == {0.0, 1.0}
     assert max(flown.series("uncertainty", 1)) > 3
     assert all(x == int(x) <= world.law.cells.size for x in flown.series("uncertainty", 1))
 

@@ -10,7 +10,7 @@ import pytest
 
 from tmc.kernel.config import build
 from tmc.kernel.grid import ACTIONS, N_ACTIONS
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 
 Fly = Callable[..., Any]
@@ -24,9 +24,9 @@ def toronto() -> World:
 def test_eq_10_in_scenario_1_the_observation_is_the_state(fly: Fly) -> None:
     """[p_i, M, p_-i, U]: all of it can be read from the three channels, so the process is fully observable."""
     flown = fly({"scenario": 1, "world.alpha": 0.1})
-    world, observer = flown.world, Observer(flown.world)
-    for (episode, uav, t), sight in flown.sights.items():
-        positions, terrain, u = observer.observe(sight.cell, sight.peers, sight.u).reshape(3, -1)
+    world, observer = flown.world, ObservationBuilder(flown.world)
+    for (episode, uav, t), state in flown.sights.items():
+        positions, terrain, u = observer.observe(state.cell, state.peers, state.u).reshape(3, -1)
         team = flown.cells[episode][t].tolist()
         assert np.flatnonzero(positions == 1.0).tolist() == [team[uav]]
         assert np.flatnonzero(positions == 0.5).tolist() == sorted(team[:uav] + team[uav + 1 :])
@@ -36,7 +36,7 @@ def test_eq_10_in_scenario_1_the_observation_is_the_state(fly: Fly) -> None:
 
 def test_eqs_11_and_12_observation_has_three_channels_of_m_by_m(toronto: World) -> None:
     """o_i = [P_i, M, U_i]; different values for the ego UAV and N_i, and for obstacles, free cells and roads."""
-    observer = Observer(toronto)
+    observer = ObservationBuilder(toronto)
     u = np.linspace(0, 1, toronto.law.cells.size)
     observation = observer.observe(435, [436, 404], u)
     assert observation.shape == (3, 30, 30)
@@ -66,7 +66,7 @@ def test_sec_3b_actions_lead_to_the_neighbouring_cells(toronto: World) -> None:
 def test_eq_13_reward_of_every_step(pilot: str, scenario: int, fly: Fly) -> None:
     """r = r^c + r^n + lambda r^u: -20 when blocked and nothing else; +1 for a cell not visited so far; 5 u_k before
     the visit, by the true map. Recomputed from cells and blocks; the journal holds the team's mean."""
-    flown = fly({"team.pilot": pilot, "scenario": scenario, "world.alpha": 0.05, "team.size": 6})
+    flown = fly({"team.controller": pilot, "scenario": scenario, "world.alpha": 0.05, "team.size": 6})
     world, index = flown.world, flown.world.law.index_list
     blocks = {(r.episode, r.tick - n, r.uav): b for r in flown.records for n, b in enumerate(r.blocks[::-1].tolist())}
     assert any(blocks.values())

@@ -32,7 +32,7 @@ def test_sec_2d_scenario_1_visited_cells_are_cleared_then_new_events_appear(fly:
 def test_sec_2d_local_and_global_update(period: int, initial: str, fly: Fly) -> None:
     """Between exchanges tau = t for the own cell and those of sensed UAVs; at an exchange every visit up to t."""
     settings = {"comms.period": period, "world.initial_map": initial, "team.size": 6}
-    flown = fly({**settings, "team.pilot": "planner:greedy"})
+    flown = fly({**settings, "team.controller": "planner:greedy"})
     world, team = flown.world, range(6)
     for episode, cells in flown.cells.items():
         tau = np.zeros((6, world.grid.size), np.uint16)

@@ -13,7 +13,7 @@ from tmc.kernel.world import World
 TABLE_I = [
     ("Adam optimizer learning rate", "dqn.learning_rate", 0.001),
     ("replay memory size", "replay.capacity", 100_000),
-    ("mini-batch size b", "dqn.batch", 128),
+    ("mini-batch size b", "dqn.batch_size", 128),
     ("target network update frequency f", "dqn.target_episodes", 5),
     ("discount factor gamma", "dqn.gamma", 0.99),
     ("filter size of the convolutional layers", "network.kernel", 4),

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.readers.missions import make
-from tmc.record.reader import Entry, Log
+from tmc.record.reader import Log, LogMessage
 
 
 @dataclass
@@ -19,7 +19,7 @@ class Topic:
     """A topic of one log by our own reader: its schema, and its messages in file order."""
 
     schema: str
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[LogMessage] = field(default_factory=list)
 
     @property
     def times(self) -> list[int]:
@@ -42,7 +42,7 @@ KINDS = {
     "tmc": [f"{name}/tmc.mcap" for name in LIVE],
     "learner": ["trained/learner.mcap"],
     "uav": [f"{name}/uav-*.mcap" for name in LIVE],
-    "sealed": ["sealed/*.mcap"],
+    "compacted": ["compacted/*.mcap"],
     "merged": ["merged/*.mcap"],
     "replay": ["replay/*.mcap"],
     "resumed": ["resumed-*/*.mcap"],

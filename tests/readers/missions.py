@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from tests.command import LINE, PATIENCE, descendants, here, overfly
+from tests.command import LINE, PATIENCE_S, descendants, here, overfly
 from tmc.kernel.config import Journal
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
@@ -21,9 +21,10 @@ from tmc.record.writer import LogWriter
 FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures")
 # Slow enough to be still in flight when all have written.
 KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", "--set", "replay.learn_start=60",
-          "--set", "dqn.batch=16", "--set", "journal.flush=0.1")  # fmt: skip
+          "--set", "dqn.batch_size=16", "--set", "journal.flush_interval=0.1")  # fmt: skip
 LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures", "--set", "trial.stall=0.06",
-          "--set", "comms.patience=0.5", "--set", "comms.lost_after=1", "--set", "journal.flush=0.1")  # fmt: skip
+          "--set", "comms.silence_warning=0.5", "--set", "comms.lost_after=1",
+          "--set", "journal.flush_interval=0.1")  # fmt: skip
 CHUNK = 0x06
 """The opcode of a chunk of messages."""
 MADE = {
@@ -46,8 +47,8 @@ def make(folder: Path, trained: Path) -> None:
     lose_one(folder / "losing")
     done = here(*FLOWN, "--lockstep", "--out", folder / "lockstep", cwd=folder)
     assert done.returncode == 0, done.stderr
-    shutil.copytree(folder / "trained", folder / "sealed")
-    done = here("log", "seal", folder / "sealed", cwd=folder)
+    shutil.copytree(folder / "trained", folder / "compacted")
+    done = here("log", "compact", folder / "compacted", cwd=folder)
     assert done.returncode == 0, done.stderr
     kill_in_flight(folder / "killed")
     cut(folder / "killed" / f"tmc.mcap{ACTIVE}", folder / "cut")
@@ -110,7 +111,7 @@ def lose_one(out: Path) -> None:
         os.kill(silent, signal.SIGSTOP)
         _await(run, lambda: "/tmc/lost" in info(out / f"tmc.mcap{ACTIVE}").topics)
         os.kill(silent, signal.SIGCONT)
-        assert run.wait(PATIENCE) == 0
+        assert run.wait(PATIENCE_S) == 0
 
 
 def kill_in_flight(out: Path) -> None:
@@ -134,7 +135,7 @@ def _await_messages(run: subprocess.Popen[bytes], logs: list[Path]) -> None:
 
 
 def _await(run: subprocess.Popen[bytes], what: Callable[[], bool]) -> None:
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while not what():
         assert run.poll() is None and time.monotonic() < until, "it did not come to it while the mission flew"
         time.sleep(0.1)

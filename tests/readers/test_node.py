@@ -13,7 +13,7 @@ import pytest
 from google.protobuf import json_format
 from mcap.writer import Writer
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tests.readers.conftest import Topic
 from tmc.record import schemas
 
@@ -30,7 +30,7 @@ def node() -> Read:
 
     def run(*args: object) -> subprocess.CompletedProcess[str]:
         command = [program, str(HERE / "read.mjs"), *map(str, args)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
     return run
 

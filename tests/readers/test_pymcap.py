@@ -20,7 +20,9 @@ from mcap.writer import Writer
 
 Pymcap = Callable[..., subprocess.CompletedProcess[str]]
 MEANT = {"METADATA_NAME_DUPLICATE", "CHUNK_COMPRESSION_INEFFICIENT"}
-"""Warnings of what is as it should be: each life of a process leaves its metadata, and small chunks hardly shrink."""
+"""Warnings of what is as it should be: each incarnation of a process leaves its metadata, and small chunks hardly
+shrink.
+"""
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tests.readers.conftest import Topic
 from tmc.record.reader import Log
 
@@ -98,6 +98,6 @@ def test_pybag_recovers_what_a_kill_left(killed: list[Path], ours, tmp_path: Pat
     for path in killed:
         again = tmp_path / f"again-{path.name}"
         command = [program, "recover", path, "--output", again, "--chunk-size", "65536", "--chunk-compression", "zstd"]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert done.returncode == 0, done.stderr
         assert_as_we_read_it(found(again), ours(path))

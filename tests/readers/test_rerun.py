@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tests.readers.conftest import Topic
 
 Rerun = Callable[..., subprocess.CompletedProcess[str]]
@@ -34,7 +34,7 @@ def rerun(tmp_path: Path) -> Rerun:
 
     def run(*args: object) -> subprocess.CompletedProcess[str]:
         command = [program, *map(str, args)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, env=env)
+        return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=env)
 
     assert run("analytics", "disable").returncode == 0
     return lambda *args: run("mcap", *args)

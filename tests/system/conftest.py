@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests import command
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -52,7 +52,7 @@ def running() -> Callable[[str], list[int]]:
 def no_process_left(tmp_path: Path) -> Iterator[None]:
     """Whatever a test started with its folder in the command line is gone when it ends."""
     yield
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while (left := processes_of(str(tmp_path))) and time.monotonic() < until:
         time.sleep(0.05)
     assert left == []

@@ -165,7 +165,7 @@ def _ip(*words: str) -> None:
 
 
 def _tap(device: str) -> int:
-    """The file of a new TAP device, which lives as long as the file is open."""
+    """The file of a new TAP device, which incarnations as long as the file is open."""
     file = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         fcntl.ioctl(file, _TUNSETIFF, struct.pack("16sH22x", device.encode(), _IFF_TAP | _IFF_NO_PI))

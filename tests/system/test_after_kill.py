@@ -1,4 +1,4 @@
-"""A whole mission killed with SIGKILL: its logs are checked, recovered and sealed; what was flushed is all there."""
+"""A whole mission killed with SIGKILL: its logs are checked, recovered and compacted; what was flushed is all there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tmc.record.reader import Log
 
 
@@ -18,15 +18,15 @@ def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(here, running
     out = tmp_path / "R"
     command = [sys.executable, "-P", "-m", "deploy.cli", "fly", "planner:greedy", "--actors", "3", "--ticks", "60000"]
     with subprocess.Popen([*command, "--out", str(out)], cwd=tmp_path, stderr=subprocess.DEVNULL) as run:
-        until = time.monotonic() + PATIENCE
+        until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until and not flying(out / "tmc.mcap.active"):
             time.sleep(0.1)
-        refused = here("log", "seal", out)
+        refused = here("log", "compact", out)
         assert refused.returncode == 1 and "is being written by another process" in refused.stderr
         assert run.poll() is None, "the mission was over before it could be killed"
         for pid in [run.pid, *running(str(out))]:
             kill(pid)
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while running(str(out)) and time.monotonic() < until:
         time.sleep(0.05)
     logs = {path.name: held(path) for path in out.glob("*.active")}
@@ -40,8 +40,8 @@ def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(here, running
         log = Log(out / name.replace(".mcap.active", ".recovered.mcap"))
         assert log.finished and sum(1 for _ in log.raw()) == messages
         log.path.unlink()
-    sealed = here("log", "seal", out)
-    assert sealed.returncode in (0, 3), sealed.stderr
+    compacted = here("log", "compact", out)
+    assert compacted.returncode in (0, 3), compacted.stderr
     assert not list(out.glob("*.active"))
     assert {f"{p.name}.active": held(p) for p in out.glob("*.mcap")} == logs
     assert here("log", "check", out).returncode == 0

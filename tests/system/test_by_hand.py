@@ -7,7 +7,7 @@ from pathlib import Path
 
 import zmq
 
-from tests.command import LINE, PATIENCE
+from tests.command import LINE, PATIENCE_S
 from tmc.record.facts import digest
 from tmc.wire import messages as m
 from tmc.wire import sockets
@@ -25,7 +25,7 @@ def test_roles_by_hand_over_tcp_fly_the_same(here, tmp_path: Path) -> None:
     tmc = start(tmp_path, "tmc", "--fly", "planner:greedy", *options, "--bind", endpoint, "--out", tmp_path / "R")
     uavs = [start(tmp_path, "actor", "--id", i, "--connect", endpoint, "--out", tmp_path / "U") for i in range(4)]
     for process in (*uavs, tmc):
-        _, errors = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, errors
     alone = ("fly", "planner:greedy", *options, "--lockstep", "--no-pictures", "--out", tmp_path / "L")
     assert here(*alone).returncode == 0
@@ -34,12 +34,23 @@ def test_roles_by_hand_over_tcp_fly_the_same(here, tmp_path: Path) -> None:
 
 def test_a_learner_by_hand(tmp_path: Path) -> None:
     endpoint = f"tcp://127.0.0.1:{sockets.free_port()}"
-    small = ("--actors", 1, "--ticks", 60, "--episodes", 1, "--set", "replay.learn_start=20", "--set", "dqn.batch=8")
+    small = (
+        "--actors",
+        1,
+        "--ticks",
+        60,
+        "--episodes",
+        1,
+        "--set",
+        "replay.learn_start=20",
+        "--set",
+        "dqn.batch_size=8",
+    )
     tmc = start(tmp_path, "tmc", "patrol", *small, "--bind", endpoint, "--out", tmp_path / "R")
     uav = start(tmp_path, "actor", "--id", 0, "--connect", endpoint, "--out", tmp_path / "U")
     learner = start(tmp_path, "learner", "--connect", endpoint, "--out", tmp_path / "L")
     for process in (uav, learner, tmc):
-        _, errors = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, errors
     assert (tmp_path / "L" / "policies" / "final.onnx").is_file()
 
@@ -50,7 +61,7 @@ def test_a_busy_port_is_one_sentence(tmp_path: Path) -> None:
         taken = context.socket(zmq.ROUTER)
         taken.bind(f"tcp://127.0.0.1:{port}")
         tmc = start(tmp_path, "tmc", "--bind", f"tcp://127.0.0.1:{port}", "--out", tmp_path / "R")
-        _, errors = tmc.communicate(timeout=PATIENCE)
+        _, errors = tmc.communicate(timeout=PATIENCE_S)
         taken.close()
     assert tmc.returncode == 2
     assert errors.count("\n") == 1 and "free port" in errors
@@ -67,18 +78,18 @@ def test_hostile_frames_change_nothing(here, tmp_path: Path) -> None:
         hostile = [sockets.dealer(context, endpoint, f"observer-{i}") for i in range(3)]
         replies = [0, 0, 0]
         hostile[0].send(good[0])
-        assert hostile[0].poll(1000 * PATIENCE), "the TMC did not answer"
+        assert hostile[0].poll(1000 * PATIENCE_S), "the TMC did not answer"
         for round_ in range(40):
             for sock in hostile:
                 sock.send_multipart([bad[round_ % len(bad)], *[b"y"] * (round_ % 20)])
                 sock.send(good[round_ % len(good)])
         uavs = [start(tmp_path, "actor", "--id", i, "--connect", endpoint, "--out", tmp_path / "U") for i in range(2)]
         for i, sock in enumerate(hostile):
-            while replies[i] < 34 and sock.poll(1000 * PATIENCE):
+            while replies[i] < 34 and sock.poll(1000 * PATIENCE_S):
                 replies[i] += isinstance(sockets.receive_message(sock), m.Error)
             sock.close()
         for process in (*uavs, tmc):
-            _, errors = process.communicate(timeout=PATIENCE)
+            _, errors = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 0, errors
     assert sum(replies) >= 100
     alone = ("fly", "planner:greedy", *options, "--lockstep", "--no-pictures", "--out", tmp_path / "L")

@@ -12,10 +12,10 @@ import pytest
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 SHORT = ("--actors", "3", "--ticks", "400", "--json")
-LIGHT = ("--actors", "2", "--ticks", "200", "--set", "dqn.batch=8", "--set", "replay.learn_start=16", "--json")
+LIGHT = ("--actors", "2", "--ticks", "200", "--set", "dqn.batch_size=8", "--set", "replay.learn_start=16", "--json")
 
 
-def storm(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
+def schedule(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
     """The trial's row; nothing but progress may have gone to stderr."""
     done = overfly("verify", "chaos", *options)
     assert done.returncode == code, done.stdout + done.stderr
@@ -33,7 +33,7 @@ def storm(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
 def test_missions_that_are_disturbed_fly_what_lock_step_flies(
     overfly: Overfly, tmp_path: Path, kills: int, episodes: int, options: tuple[str, ...]
 ) -> None:
-    row = storm(overfly, "--mode", "fly", "--kills", str(kills), "--episodes", str(episodes), *SHORT, *options)
+    row = schedule(overfly, "--mode", "fly", "--kills", str(kills), "--episodes", str(episodes), *SHORT, *options)
     assert row["faults"] == [] and row["folder"] == ""
     assert sum(row["kills"].values()) == kills and row["back"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
@@ -43,14 +43,14 @@ def test_missions_that_are_disturbed_fly_what_lock_step_flies(
 
 @pytest.mark.slow
 def test_a_training_that_is_disturbed_goes_on(overfly: Overfly) -> None:
-    row = storm(overfly, "--kills", "5", "--storm", "20", *LIGHT)
+    row = schedule(overfly, "--kills", "5", "--fault-seed", "20", *LIGHT)
     assert row["faults"] == [] and set(row["kills"]) == {"tmc", "learner", "uav"} and row["back"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["updates"] > 0 and row["acknowledged"] > 0
 
 
 @pytest.mark.slow
 def test_power_cuts_take_nothing_that_was_acknowledged(overfly: Overfly) -> None:
-    row = storm(overfly, "--mode", "fly", "--power", "--kills", "5", "--storm", "2", "--episodes", "4", *SHORT)
+    row = schedule(overfly, "--mode", "fly", "--power", "--kills", "5", "--fault-seed", "2", "--episodes", "4", *SHORT)
     assert row["faults"] == [] and row["kills"]["power"] >= 1 and row["back"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
 
@@ -66,11 +66,11 @@ def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly
         "journal.durability=process",
         "--kills",
         "4",
-        "--storm",
+        "--fault-seed",
         "2",
         *SHORT,
     )
-    row = storm(overfly, *options, "--episodes", "2", "--keep", str(tmp_path / "kept"), code=1)
+    row = schedule(overfly, *options, "--episodes", "2", "--keep", str(tmp_path / "kept"), code=1)
     assert row["lost"] > 0 and row["bytes_cut"] > 0
 
 
@@ -78,6 +78,6 @@ def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly
 @pytest.mark.parametrize("options", [("--mode", "fly", "--episodes", "2", *SHORT), LIGHT], ids=["fly", "train"])
 def test_losses_are_seen_when_there_are_some(overfly: Overfly, tmp_path: Path, options: tuple[str, ...]) -> None:
     """The counter-check. What was kept shows it too: the last commit is older than what was acknowledged."""
-    row = storm(overfly, "--ack-early", "--kills", "12", *options, "--keep", str(tmp_path / "kept"), code=1)
+    row = schedule(overfly, "--ack-early", "--kills", "12", *options, "--keep", str(tmp_path / "kept"), code=1)
     assert row["lost"] > 0 and any("were acknowledged and are lost" in fault for fault in row["faults"])
     assert row["folder"] == str(tmp_path / "kept") and "did not survive" in (tmp_path / "kept/diary.txt").read_text()

@@ -32,7 +32,7 @@ def missions(draw: st.DrawFn) -> tuple[list[str], dict[str, Any]]:
     return raster, {
         "scenario": draw(st.sampled_from([1, 2, 2])),
         "team.size": draw(st.integers(1, min(roads, 6))),
-        "team.pilot": draw(st.sampled_from(["planner:greedy", "planner:random-road", "planner:random"])),
+        "team.controller": draw(st.sampled_from(["planner:greedy", "planner:random-road", "planner:random"])),
         "team.sensing_range": draw(st.sampled_from([1.0, 1.5, 3.0])),
         "comms.period": draw(st.integers(1, 12)),
         "comms.phase": draw(st.sampled_from(["together", "staggered"])),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import LINE, PATIENCE
+from tests.command import LINE, PATIENCE_S
 from tests.system.hosts import Hosts, hosts, why_not
 from tmc.record.facts import digest
 from tmc.record.reader import read
@@ -56,7 +56,7 @@ def start(undo: contextlib.ExitStack, folder: Path, net: Hosts, host: int, *args
 
 def assert_flown_as_in_one_process(here, processes: list[subprocess.Popen[str]], folder: Path, ticks: int) -> None:
     for process in (*processes[1:], processes[0]):
-        _, errors = process.communicate(timeout=PATIENCE)
+        _, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, errors
     alone = here("fly", "planner:greedy", *TEAM, "--ticks", ticks, "--lockstep", "--no-pictures", "--out", "L")
     assert alone.returncode == 0, alone.stderr
@@ -82,7 +82,7 @@ def test_a_host_that_is_cut_off_in_flight_and_comes_back_changes_nothing(here, t
 
 def until_flown(log: Path, uav: int, tick: int) -> None:
     """Wait until a UAV's log says that it has reached a tick."""
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         if log.exists() and any(status.message.tick >= tick for status in read(log, [f"/uav/{uav}/status"])):
             return

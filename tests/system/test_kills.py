@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import LINE, PATIENCE
+from tests.command import LINE, PATIENCE_S
 from tmc.record.facts import digest
 
 
@@ -42,7 +42,7 @@ def test_a_uav_killed_at_up_to_ten_random_ticks_flies_the_same(
                 while found[0] in running("actors --id 1 --connect ipc:///"):
                     time.sleep(0.01)
             time.sleep(0.01)
-        _, errors = run.communicate(timeout=PATIENCE)
+        _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert 0 < kills - 1 <= errors.count("uav-001 was killed by SIGKILL; it is started again") <= kills
     assert here(*mission, "--lockstep", "--out", tmp_path / "calm").returncode == 0

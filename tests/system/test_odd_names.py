@@ -43,7 +43,7 @@ def test_a_run_folder_may_be_called_anything(name: bytes, tmp_path: Path) -> Non
     flown = overfly(tmp_path, *FLY, f"--out={out}")
     assert flown.returncode == 0, flown.stderr
     assert set(json.loads((tmp_path / out / "run.json").read_text())["exit_codes"].values()) == {0}
-    for command in (("analyze", "--no-pictures"), ("log", "check"), ("log", "info"), ("log", "seal")):
+    for command in (("analyze", "--no-pictures"), ("log", "check"), ("log", "info"), ("log", "compact")):
         done = here(*command, "--", out, cwd=tmp_path)
         assert done.returncode == 0, (command, done.stderr)
         flown.stdout += done.stdout + done.stderr

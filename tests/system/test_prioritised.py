@@ -1,4 +1,6 @@
-"""A training with `replay.priority`, as processes and in lock step: its log tells all but what the learner found."""
+"""A training with `replay.priority_exponent`, as processes and in lock step: its log tells all but what the learner
+found.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ SMALL = {
     "training.ticks": 60,
     "training.episodes": 3,
     "replay.learn_start": 60,
-    "dqn.batch": 16,
-    "replay.priority": 0.6,
+    "dqn.batch_size": 16,
+    "replay.priority_exponent": 0.6,
 }
 
 
@@ -56,6 +58,6 @@ def test_the_learner_changes_priorities_and_the_journal_has_the_first_ones(tmp_p
     assert mine is not None and first is not None and mine.added == first.added == 3 * 60 * 3
     numbers = np.arange(mine.added)
     changed = mine.mass(numbers) != first.mass(numbers)
-    # Who was drawn was judged; some 150 minibatches of 16 were, so that few of 540 were never drawn.
+    # PolicySpec was drawn was judged; some 150 minibatches of 16 were, so that few of 540 were never drawn.
     assert 300 < changed.sum() < mine.added
     assert len(np.unique(first.mass(numbers))) > 400

@@ -16,7 +16,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from deploy.cli import main
-from tests.command import LINE, PATIENCE
+from tests.command import LINE, PATIENCE_S
 from tmc.analysis.invariants.check import check
 from tmc.center.journal import journal_in
 from tmc.kernel.config import Journal
@@ -33,7 +33,7 @@ SLOW = ("--set", "trial.stall=0.01", "--set", "trial.stall_share=1.0")
 
 
 @pytest.fixture(scope="module")
-def calm(tmp_path_factory: pytest.TempPathFactory) -> str:
+def finish(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The digest of the flight when nobody disturbs it."""
     out = tmp_path_factory.mktemp("calm") / "R"
     assert main([*FLIGHT, "--lockstep", "--out", str(out)]) == 0
@@ -46,7 +46,7 @@ def begin(tmp_path: Path, *command: str) -> subprocess.Popen[str]:
 
 
 def wait_for(what: Callable[[], object], run: subprocess.Popen[str]) -> None:
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while not what():
         assert run.poll() is None and time.monotonic() < until, "it did not come to it"
         time.sleep(0.02)
@@ -72,8 +72,8 @@ def kill_all(run: subprocess.Popen[str], running: Running, out: Path) -> None:
     for pid in running(str(out)):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    run.communicate(timeout=PATIENCE)
-    until = time.monotonic() + PATIENCE
+    run.communicate(timeout=PATIENCE_S)
+    until = time.monotonic() + PATIENCE_S
     while running(str(out)) and time.monotonic() < until:
         time.sleep(0.02)
 
@@ -90,7 +90,7 @@ def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, calm
             os.kill(found[0], signal.SIGKILL)
             kills += 1
             wait_for(lambda pid=found[0]: pid not in running(str(out)), run)
-        _, errors = run.communicate(timeout=PATIENCE)
+        _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert errors.count("tmc was killed by SIGKILL; it is started again") == 5
     assert digest(out) == calm and check(out).good
@@ -113,7 +113,7 @@ def test_a_flight_goes_on_after_everything_was_killed(
     assert "Uncertainty" in again.stdout
     assert digest(out) == calm and check(out).good
     told = json.loads((out / "run.json").read_text())
-    assert set(told["exit_codes"].values()) == {0} and told["sealed"]["after"] > 0
+    assert set(told["exit_codes"].values()) == {0} and told["compacted"]["after"] > 0
     # Finished now: nothing is flown again, and the summary is said.
     size = (out / "tmc.mcap").stat()
     done = here("run", "--resume", out, "--json", "--no-pictures")
@@ -127,8 +127,16 @@ def test_training_goes_on_after_everything_was_killed(
 ) -> None:
     out = tmp_path / "R"
     small = ("--actors", "2", "--ticks", "60", "--episodes", "4", "--set", "replay.learn_start=60")
-    small = (*small, "--set", f"replay.priority={priority}")
-    small = (*small, "--set", "dqn.batch=16", "--set", "training.checkpoint_every=20", "--set", "replay.slack=20")
+    small = (*small, "--set", f"replay.priority_exponent={priority}")
+    small = (
+        *small,
+        "--set",
+        "dqn.batch_size=16",
+        "--set",
+        "training.checkpoint_every=20",
+        "--set",
+        "replay.error_buffer=20",
+    )
     with begin(tmp_path, "run", "patrol", *small, "--out", str(out)) as run:
         wait_for(lambda: ended(out) >= 1 and list((out / "checkpoints").glob("*.safetensors")), run)
         kill_all(run, running, out)
@@ -145,21 +153,21 @@ def test_training_goes_on_after_everything_was_killed(
 
 
 def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    empty, strange = tmp_path / "empty", tmp_path / "strange"
+    empty, anomalies = tmp_path / "empty", tmp_path / "anomalies"
     empty.mkdir()
-    strange.mkdir()
-    LogWriter(strange / "tmc.mcap", "tmc", Journal(), {}).close()
+    anomalies.mkdir()
+    LogWriter(anomalies / "tmc.mcap", "tmc", Journal(), {}).close()
     for command, sentence in (
         (("run", "--resume", empty), "holds no journal (tmc.mcap): --resume takes the folder of a run that was begun"),
         (("tmc", "--resume", empty), "holds no journal (tmc.mcap)"),
         (("run", "--resume", tmp_path / "gone"), "holds no journal (tmc.mcap)"),
-        (("run", "--resume", strange), "has no config.json, and its log holds none either"),
+        (("run", "--resume", anomalies), "has no config.json, and its log holds none either"),
         (
-            ("run", "quick", "--resume", strange),
+            ("run", "quick", "--resume", anomalies),
             "with its own settings, as processes: give it nothing but --json, --no-pictures",
         ),
-        (("run", "--resume", strange, "--ticks", 5), "give it nothing but --json"),
-        (("tmc", "--resume", strange, "--ticks", 5), "give it nothing but --bind"),
+        (("run", "--resume", anomalies, "--ticks", 5), "give it nothing but --json"),
+        (("tmc", "--resume", anomalies, "--ticks", 5), "give it nothing but --bind"),
         (("run",), "which preset?"),
     ):
         assert main([str(word) for word in command]) == 2
@@ -171,7 +179,7 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
 def test_a_training_in_lock_step_is_never_learned_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It leaves no checkpoint: a learner that went on with it would begin with random weights."""
     out, small = tmp_path / "R", ("--ticks", "40", "--episodes", "2", "--set", "replay.learn_start=30", "--no-pictures")
-    assert main(["run", "quick", "--lockstep", "--set", "dqn.batch=8", *small, "--out", str(out)]) == 0
+    assert main(["run", "quick", "--lockstep", "--set", "dqn.batch_size=8", *small, "--out", str(out)]) == 0
     policy = (out / "policies" / "final.onnx").read_bytes()
     assert "one, in lock step" in capsys.readouterr().out
     assert main(["run", "--resume", str(out), "--no-pictures"]) == 0  # it is over: summed up again

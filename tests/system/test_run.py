@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import PATIENCE, descendants
+from tests.command import PATIENCE_S, descendants
 from tmc.record.facts import digest
 from tmc.record.reader import Log
 
@@ -59,7 +59,7 @@ def test_the_log_knows_when_who_sent_something_made_it(trained) -> None:
 @pytest.mark.parametrize(("how", "code"), [((), 1), (("--lockstep",), 2)])
 def test_a_training_that_diverges_says_so_once(here, tmp_path: Path, how: tuple[str, ...], code: int) -> None:
     wild = ("dqn.learning_rate=10", "dqn.target_updates=1", "dqn.gamma=1", "dqn.loss=mse", "dqn.reward_scale=1000")
-    small = ("--ticks", 200, "--set", "replay.learn_start=30", "--set", "dqn.batch=8", "--no-pictures")
+    small = ("--ticks", 200, "--set", "replay.learn_start=30", "--set", "dqn.batch_size=8", "--no-pictures")
     done = here("run", "quick", *how, *small, *(x for s in wild for x in ("--set", s)), "--out", tmp_path / "R")
     assert done.returncode == code, done.stderr
     assert done.stderr.count("diverged") == 1 and "lower dqn.learning_rate or dqn.reward_scale" in done.stderr
@@ -91,8 +91,8 @@ def test_a_signal_ends_an_evaluation_and_all_its_processes(running, tmp_path: Pa
         assert run.stderr is not None and "missions" in run.stderr.readline()
         workers = descendants(run.pid)
         run.terminate()
-        assert run.wait(PATIENCE) == 143
-    until = time.monotonic() + PATIENCE
+        assert run.wait(PATIENCE_S) == 143
+    until = time.monotonic() + PATIENCE_S
     while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < until:
         time.sleep(0.05)
     assert workers and not any(Path(f"/proc/{pid}").exists() for pid in workers)
@@ -105,7 +105,7 @@ def test_a_check_whose_reader_leaves_did_not_succeed(here, tmp_path: Path) -> No
         assert cat.stdout is not None and cat.stderr is not None
         cat.stdout.readline()
         cat.stdout.close()
-        assert (cat.wait(PATIENCE), cat.stderr.read()) == (141, b"")
+        assert (cat.wait(PATIENCE_S), cat.stderr.read()) == (141, b"")
 
 
 def test_a_run_folder_that_exists_is_refused(here, tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_uav_that_is_killed_comes_back_and_the_run_goes_on(here, running, tmp_
     command = [sys.executable, "-P", "-m", "deploy.cli", *mission]
     with subprocess.Popen([*command, "--out", str(out)], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as run:
         killed = kill_when_up(running, "actors --id 1 --connect ipc:///", str(out), out / "uav-001.mcap.active")
-        _, errors = run.communicate(timeout=PATIENCE)
+        _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert killed and "uav-001 was killed by SIGKILL; it is started again" in errors
     calm = tmp_path / "calm"
@@ -134,7 +134,7 @@ def test_a_uav_that_is_killed_comes_back_and_the_run_goes_on(here, running, tmp_
 
 def kill_when_up(running: Callable[[str], list[int]], marker: str, out: str, log: Path) -> bool:
     """SIGKILL the process whose command line holds both texts, once it flies."""
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         both = set(running(marker)) & set(running(out))
         if both and log.exists():
@@ -149,12 +149,12 @@ def test_ctrl_c_ends_in_order(running, tmp_path: Path) -> None:
     out = tmp_path / "R"
     command = [sys.executable, "-P", "-m", "deploy.cli", "run", "patrol", "--actors", "2", "--out", str(out)]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as run:
-        until = time.monotonic() + PATIENCE
+        until = time.monotonic() + PATIENCE_S
         while not (out / "learner.mcap.active").exists() and time.monotonic() < until:
             time.sleep(0.05)
         time.sleep(1.0)
         run.send_signal(signal.SIGINT)
-        _, errors = run.communicate(timeout=PATIENCE)
+        _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 130
     assert "stopped; what was flown is in" in errors and "Traceback" not in errors
     assert (out / "tmc.mcap").is_file() and (out / "learner.mcap").is_file()
@@ -164,12 +164,12 @@ def test_children_die_with_a_supervisor_that_is_killed(running, tmp_path: Path) 
     out = tmp_path / "R"
     command = [sys.executable, "-P", "-m", "deploy.cli", "run", "patrol", "--actors", "2", "--out", str(out)]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL) as run:
-        until = time.monotonic() + PATIENCE
+        until = time.monotonic() + PATIENCE_S
         while len(running(str(out))) < 5 and time.monotonic() < until:
             time.sleep(0.05)
         time.sleep(0.5)
         run.kill()
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while running(str(out)) and time.monotonic() < until:
         time.sleep(0.05)
     assert running(str(out)) == []
@@ -181,7 +181,7 @@ def test_two_runs_side_by_side(tmp_path: Path) -> None:
         subprocess.Popen([*command, "--out", str(tmp_path / name)], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
         for name in "ab"
     ]
-    errors = [run.communicate(timeout=PATIENCE)[1] for run in runs]
+    errors = [run.communicate(timeout=PATIENCE_S)[1] for run in runs]
     assert [run.returncode for run in runs] == [0, 0], errors
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import LINE, PATIENCE
+from tests.command import LINE, PATIENCE_S
 from tmc.record.reader import Log, info, run_files
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
@@ -45,9 +45,9 @@ def test_a_team_of_processes_and_lock_step_give_the_same_replay_file(
 
 def test_what_a_killed_mission_leaves_can_be_merged_and_replayed(here: Overfly, tmp_path: Path) -> None:
     command = [*LINE, "fly", "planner:greedy", "--actors", "2", "--out", "K",
-               "--set", "journal.flush=0.1", "--ticks", "60000"]  # fmt: skip
+               "--set", "journal.flush_interval=0.1", "--ticks", "60000"]  # fmt: skip
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as mission:
-        log, end = tmp_path / "K" / "tmc.mcap.active", time.monotonic() + PATIENCE
+        log, end = tmp_path / "K" / "tmc.mcap.active", time.monotonic() + PATIENCE_S
         while not (log.is_file() and log.stat().st_size > 30_000) and time.monotonic() < end:
             time.sleep(0.05)
         os.kill(mission.pid, signal.SIGKILL)  # its children die with it
@@ -60,8 +60,8 @@ def test_what_a_killed_mission_leaves_can_be_merged_and_replayed(here: Overfly, 
     assert info(replayed.path).topics["/uav/1/belief"].count == ticks + 1
     merged = here("log", "merge", "K")
     assert merged.returncode == 0 and "tmc.mcap.active is not closed" in merged.stderr
-    sound = sum(t.count for path in run_files(tmp_path / "K").values() for t in info(path).topics.values())
-    assert sound == sum(t.count for t in info(tmp_path / "K" / "merged.mcap").topics.values()) > 100
+    intact = sum(t.count for path in run_files(tmp_path / "K").values() for t in info(path).topics.values())
+    assert intact == sum(t.count for t in info(tmp_path / "K" / "merged.mcap").topics.values()) > 100
 
 
 @pytest.mark.parametrize("view", ["merge", "replay"])

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from actors.airspace import Waiting
 from actors.pilot import LostRecordsError, Phase, Pilot
-from actors.planners import PlannerDecider, Sight
+from actors.planners import LocalState, PlannerController
 from actors.radio import RadioTracks
 from actors.tracks import TableTracks, TrackTable
-from tmc.center.entries import Entry
+from tmc.center.entries import JournalEntry
 from tmc.center.roster import uav_name
 from tmc.center.station import Station
 from tmc.kernel.config import build
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Floats, Ints, Observer
+from tmc.kernel.observation import Floats, Ints, ObservationBuilder
 from tmc.kernel.roadmap import RoadMap, load_map, parse_raster
 from tmc.kernel.world import World
 from tmc.wire import messages as m
@@ -50,16 +50,16 @@ class Wanderer:
         self.grid, self.masks = world.grid, world.config.exploration.mask_blocked
         self.middle = world.grid.cell(world.grid.rows // 2, world.grid.cols // 2)
 
-    def choose(self, sight: Sight) -> int:
-        if sight.draw >= 0.5:
-            return int((2 * sight.draw - 1) * N_ACTIONS)
-        targets = self.grid.target_lists[sight.cell]
+    def choose(self, state: LocalState) -> int:
+        if state.draw >= 0.5:
+            return int((2 * state.draw - 1) * N_ACTIONS)
+        targets = self.grid.target_lists[state.cell]
         inside = [a for a in range(N_ACTIONS) if targets[a] >= 0]
         return min(inside, key=lambda a: self.grid.chebyshev(targets[a], self.middle))
 
-    def worth(self, sight: Sight, action: int) -> tuple[float, float]:
-        q = nine(sight.tick, sight.cell)
-        return q[action], max(q[a] for a in sight.allowed) if self.masks else max(q)
+    def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
+        q = nine(state.tick, state.cell)
+        return q[action], max(q[a] for a in state.allowed) if self.masks else max(q)
 
 
 def nine(tick: int, cell: int) -> list[float]:
@@ -99,14 +99,14 @@ class Mission:
     ) -> None:
         config = build({"training.episodes": 1, **values})
         self.world, self.radio = World(config, road_map), radio
-        fixed = b"policy" if config.team.pilot == "policy" and not learning else None
+        fixed = b"policy" if config.team.controller == "policy" and not learning else None
         tracks = "" if radio else "a table"
         self.station = Station(self.world, "run", learning=learning, policy=fixed, tracks=tracks)
         self.N, self.T = config.team.size, config.training.ticks
-        self.observer = Observer(self.world)
+        self.observer = ObservationBuilder(self.world)
         self.table = TrackTable(self.N, self.T)
         self.seen: dict[tuple[int, int, int], tuple[np.ndarray[Any, Any], list[int]]] = {}
-        self.entries: list[Entry] = []
+        self.entries: list[JournalEntry] = []
         self.safe, self.groups = 0, lambda: True
         """How many of the entries are committed; whether the group commit falls after this message."""
         self.notes: list[tuple[str, str]] = []
@@ -118,21 +118,21 @@ class Mission:
         self.home: set[int] = set()
         self.waits: dict[int, Waiting] = {}
         self.asked = self.restarts = 0
-        self.lives = [0] * self.N
+        self.incarnations = [0] * self.N
         self.pilots: list[SpyPilot] = []
         for i in range(self.N):
             self.pilots.append(self._pilot(i))
-            self.up[i].append(m.Hello("uav", i, self.lives[i]))
+            self.up[i].append(m.Hello("uav", i, self.incarnations[i]))
 
     def _pilot(self, i: int) -> SpyPilot:
-        who = self.world.config.team.pilot
-        planner = None if who == "policy" else PlannerDecider(self.world, who)
-        self.lives[i] += 1
+        who = self.world.config.team.controller
+        planner = None if who == "policy" else PlannerController(self.world, who)
+        self.incarnations[i] += 1
         tracks: TableTracks | RadioTracks = TableTracks(self.table, i)
         if self.radio:
             tracks = RadioTracks(i, self.N, self.world.grid, self.observer.sensing, self.up[i].append)
         pilot = SpyPilot(
-            self.world, i, self.lives[i], tracks, self.observer, lambda _: Wanderer(self.world), planner
+            self.world, i, self.incarnations[i], tracks, self.observer, lambda _: Wanderer(self.world), planner
         )  # fmt: skip
         pilot.seen = self.seen
         return pilot
@@ -205,7 +205,7 @@ class Mission:
             pilot.airspace.tracks.hear(message)
         if isinstance(message, m.Error):
             assert self.restarts and message.code == "state", message.text
-            answer = m.Hello("uav", i, self.lives[i])
+            answer = m.Hello("uav", i, self.incarnations[i])
         if pilot.phase is Phase.ACT and pilot.t == self.T:
             pilot.note()
         if answer is not None:
@@ -214,9 +214,9 @@ class Mission:
     def _say_again(self, i: int, sequence: int) -> None:
         """What the TMC has not; a process that took over what TMC and process lost together starts anew."""
         try:
-            self.up[i].extend(self.pilots[i].missed(sequence))
+            self.up[i].extend(self.pilots[i].records_from(sequence))
         except LostRecordsError:
-            assert self.restarts and self.lives[i] > 1, "acknowledged records are lost"
+            assert self.restarts and self.incarnations[i] > 1, "acknowledged records are lost"
             self.lose(i, on_the_air=False)
 
     def silence(self) -> None:
@@ -233,7 +233,7 @@ class Mission:
             elif pilot.phase is Phase.POLICY:
                 self.up[i].append(m.PolicyRequest(pilot.wanted))
             else:
-                self.up[i].append(m.Hello("uav", i, self.lives[i]))
+                self.up[i].append(m.Hello("uav", i, self.incarnations[i]))
 
     def lose(self, i: int, *, on_the_air: bool) -> None:
         """UAV i's process dies, with what it was about to send unless that is on the air; a new one says hello."""
@@ -241,9 +241,9 @@ class Mission:
             self.up[i].clear()
         self.down[i].clear()
         self.pilots[i] = self._pilot(i)
-        self.up[i].append(m.Hello("uav", i, self.lives[i]))
+        self.up[i].append(m.Hello("uav", i, self.incarnations[i]))
 
-    def restart(self, station: Station, entries: list[Entry]) -> None:
+    def restart(self, station: Station, entries: list[JournalEntry]) -> None:
         """The TMC is killed, and `station` goes on with these entries in its journal; what was on the air is lost."""
         self.station, self.entries, self.safe = station, entries, len(entries)
         self.restarts += 1

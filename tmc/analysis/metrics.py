@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.analysis.run_data import UNKNOWN, Episode, Flown, Learning, read
+from tmc.analysis.run_data import UNKNOWN, Episode, Learning, RunData, read
 from tmc.analysis.summary import EpisodeFacts, Health, Mean, Mission, Pace, Summary
 from tmc.kernel.reward import Block
 from tmc.kernel.uncertainty import lower_bound
@@ -29,7 +29,7 @@ def summary(folder: Path) -> Summary:
     return summarize(read(folder))
 
 
-def summarize(flown: Flown) -> Summary:
+def summarize(flown: RunData) -> Summary:
     """The summary of what was read."""
     world, cells = flown.world, flown.world.law.cells.size
     facts = tuple(episode_facts(world, episode) for episode in flown.episodes)
@@ -131,10 +131,10 @@ def _wait(tick: int, visits: list[int]) -> int:
     return visits[place] - tick if place < len(visits) else 0
 
 
-def _mission(flown: Flown, episodes: int) -> Mission:
+def _mission(flown: RunData, episodes: int) -> Mission:
     world, config = flown.world, flown.world.config
     learning = is_learning(flown)
-    fixed = "a fixed policy" if config.team.pilot == "policy" else config.team.pilot
+    fixed = "a fixed policy" if config.team.controller == "policy" else config.team.controller
     return Mission(
         command=str(flown.outcome.get("command", "")),
         who="a policy in training" if learning else fixed,
@@ -155,10 +155,10 @@ def _mission(flown: Flown, episodes: int) -> Mission:
     )
 
 
-def is_learning(flown: Flown) -> bool:
+def is_learning(flown: RunData) -> bool:
     """True when a learner took part: a policy flew, and not one that was fixed from the start."""
     learned = "learner" in flown.files or flown.updates > 0
-    return flown.world.config.team.pilot == "policy" and (learned or not (flown.folder / FIXED_POLICY).exists())
+    return flown.world.config.team.controller == "policy" and (learned or not (flown.folder / FIXED_POLICY).exists())
 
 
 def _mean(facts: Iterable[EpisodeFacts]) -> Mean:
@@ -173,7 +173,7 @@ def _mean(facts: Iterable[EpisodeFacts]) -> Mean:
     )
 
 
-def _pace(flown: Flown, facts: Iterable[EpisodeFacts]) -> Pace:
+def _pace(flown: RunData, facts: Iterable[EpisodeFacts]) -> Pace:
     ticks, learning = sum(f.ticks for f in facts), flown.learning
     updates, seconds = flown.updates, flown.seconds
     rate = 1.0 / seconds if seconds > 0 else 0.0
@@ -186,7 +186,7 @@ def _last(learning: Learning, name: str) -> float | None:
     return float(values[-1]) if values.size and np.isfinite(values[-1]) else None
 
 
-def _health(flown: Flown) -> Health:
+def _health(flown: RunData) -> Health:
     def table(name: str) -> dict[str, Any]:
         found = flown.outcome.get(name)
         return dict(found) if isinstance(found, Mapping) else {}

@@ -119,4 +119,4 @@ def map_of_csv(name: str, csv: str, cell_m: float = USUAL_CELL_M) -> RoadMap:
     try:
         return parse_raster(f"cell_m: {cell_m!r}\n{csv}", Path(name).stem, "the map in the log")
     except MapError as error:
-        raise RecordError(f"the map in the log is not sound, so do not use this log: {error}") from None
+        raise RecordError(f"the map in the log is not intact, so do not use this log: {error}") from None

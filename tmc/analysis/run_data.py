@@ -1,4 +1,4 @@
-"""What was flown: a run folder's logs as arrays, in one pass a file. Finished, still written or cut: what is sound."""
+"""What was flown: a run folder's logs as arrays, in one pass a file. Finished, still written or cut: what is intact."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Learning:
 
 
 @dataclass(frozen=True, eq=False)
-class Flown:
+class RunData:
     """A run. `updates`: of the network, as far as any log says. `outcome`: run.json, empty without one.
 
     `seconds`: how long its processes were at work, by a clock that is never set, without the time between them.
@@ -91,7 +91,7 @@ class Flown:
         raise RecordError(f"{self.folder} holds nothing of episode {number}: ask for one of {first} to {last}")
 
 
-def read(folder: Path) -> Flown:
+def read(folder: Path) -> RunData:
     """Read a run folder; RecordError when it is none, or when nothing was flown in it."""
     files = run_files(folder)
     if "tmc" not in files:
@@ -105,7 +105,7 @@ def read(folder: Path) -> Flown:
         raise RecordError(f"{folder} holds no flight: its mission ended before the first records came in")
     span = max(gathered.flying.total, gathered.learning.total)
     learning = _learning(gathered.learner or gathered.policies)
-    return Flown(folder, world, episodes, learning, gathered.updates, span, files, _outcome(folder), tuple(notes))
+    return RunData(folder, world, episodes, learning, gathered.updates, span, files, _outcome(folder), tuple(notes))
 
 
 def _outcome(folder: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tmc.center.episode import Exchange, Flight, Truth
+from tmc.center.episode import EpisodeState, Exchange, FinalTicks
 from tmc.center.replay import Replay
 from tmc.kernel.reward import Block
 from tmc.record.channels import uav_topic
@@ -16,7 +16,7 @@ from tmc.wire.messages import Record
 
 
 @dataclass(frozen=True)
-class Entry:
+class JournalEntry:
     """A journal entry: the topic, and the fields of its schema. `sent`: the wall clock of whoever sent it, in ns; 0
     where that is the TMC."""
 
@@ -25,64 +25,64 @@ class Entry:
     sent: int = 0
 
 
-def flight_record(record: Record) -> Entry:
+def flight_record(record: Record) -> JournalEntry:
     """A record that was accepted."""
-    return Entry(uav_topic(record.uav, "record"), {"record": record}, record.sent)
+    return JournalEntry(uav_topic(record.uav, "record"), {"record": record}, record.sent)
 
 
-def exchange(flight: Flight, done: Exchange, policy: int) -> list[Entry]:
+def exchange(episode: EpisodeState, done: Exchange, policy: int) -> list[JournalEntry]:
     """An exchange: who was answered, and in scenario II the map that they got, over all K cells."""
     values = {
-        "episode": flight.episode, "tick": done.tick, "version": done.version, "policy": policy,
+        "episode": episode.number, "tick": done.tick, "version": done.version, "policy": policy,
         "uavs": done.uavs, "believed": done.believed,
     }  # fmt: skip
-    sync = Entry("/tmc/sync", values)
-    if flight.scenario == 1:
+    sync = JournalEntry("/tmc/sync", values)
+    if episode.scenario == 1:
         return [sync]
-    whole = np.zeros(flight.world.grid.size, np.uint32)
-    whole[flight.world.law.cells] = done.last_visit
-    return [sync, Entry("/tmc/last_visit", {"last_visit": whole})]
+    whole = np.zeros(episode.world.grid.size, np.uint32)
+    whole[episode.world.law.cells] = done.last_visit
+    return [sync, JournalEntry("/tmc/last_visit", {"last_visit": whole})]
 
 
-def truth(flight: Flight, fresh: Truth, steps: int, updates: int, policy: int) -> list[Entry]:
+def truth(episode: EpisodeState, fresh: FinalTicks, steps: int, updates: int, policy: int) -> list[JournalEntry]:
     """What became final: uncertainty and mean reward by tick, and in scenario I the new events."""
     values = {
-        "episode": flight.episode, "first": fresh.first, "steps": steps, "updates": updates, "policy": policy,
+        "episode": episode.number, "first": fresh.first, "steps": steps, "updates": updates, "policy": policy,
         "uncertainty": fresh.uncertainty, "reward": fresh.reward,
     }  # fmt: skip
-    entries = [Entry("/tmc/metrics", values)]
+    entries = [JournalEntry("/tmc/metrics", values)]
     if fresh.events:
         ticks, cells = zip(*fresh.events, strict=True)
-        values = {"episode": flight.episode, "ticks": list(ticks), "cells": list(cells)}
-        entries.append(Entry("/tmc/events", values))
+        values = {"episode": episode.number, "ticks": list(ticks), "cells": list(cells)}
+        entries.append(JournalEntry("/tmc/events", values))
     return entries
 
 
-def lost(flight: Flight, uav: int) -> Entry:
+def lost(episode: EpisodeState, uav: int) -> JournalEntry:
     """A UAV that the team goes on without."""
-    return Entry("/tmc/lost", {"episode": flight.episode, "uav": uav, "tick": flight.lost[uav]})
+    return JournalEntry("/tmc/lost", {"episode": episode.number, "uav": uav, "tick": episode.lost[uav]})
 
 
-def state(flight: Flight, replay: Replay) -> Entry:
+def state(episode: EpisodeState, replay: Replay) -> JournalEntry:
     """What the TMC holds at the end of an episode: digests that whoever plays the journal must get as well."""
-    values = {"episode": flight.episode, "map": flight.digest(), "replay": replay.digest(), "transitions": len(replay)}
-    return Entry("/tmc/state", values)
+    values = {"episode": episode.number, "map": episode.digest(), "replay": replay.digest(), "transitions": len(replay)}
+    return JournalEntry("/tmc/state", values)
 
 
-def episode(flight: Flight, phase: str, epsilon: float, steps: int, updates: int) -> Entry:
+def episode(episode: EpisodeState, phase: str, epsilon: float, steps: int, updates: int) -> JournalEntry:
     """The begin of an episode with its starts, or its end with its sums."""
-    mean = flight.total_uncertainty / flight.T
-    return Entry("/tmc/episode", {
-        "episode": flight.episode, "phase": phase, "starts": flight.starts, "ticks": max(flight.done, 0),
-        "uncertainty": mean, "uncertainty_per_cell": mean / flight.world.law.cells.size,
-        "reward": [*flight.total_reward], "blocked_grid": flight.blocked[Block.GRID],
-        "blocked_obstacle": flight.blocked[Block.OBSTACLE], "blocked_uav": flight.blocked[Block.UAV],
+    mean = episode.total_uncertainty / episode.T
+    return JournalEntry("/tmc/episode", {
+        "episode": episode.number, "phase": phase, "starts": episode.starts, "ticks": max(episode.done, 0),
+        "uncertainty": mean, "uncertainty_per_cell": mean / episode.world.law.cells.size,
+        "reward": [*episode.total_reward], "blocked_grid": episode.blocked[Block.GRID],
+        "blocked_obstacle": episode.blocked[Block.OBSTACLE], "blocked_uav": episode.blocked[Block.UAV],
         "epsilon": epsilon, "updates": updates, "steps": steps,
     })  # fmt: skip
 
 
-def policy(version: int, updates: int, loss: float, model: bytes, sent: int, *, last: bool) -> Entry:
+def policy(version: int, updates: int, loss: float, model: bytes, sent: int, *, last: bool) -> JournalEntry:
     """A policy that was accepted; only the mission's last one with its model, since thousands of them may come."""
     digest = hashlib.sha256(model).hexdigest()
     values = {"version": version, "updates": updates, "sha256": digest, "loss": loss, "model": model if last else b""}
-    return Entry("/learner/policy", values, sent)
+    return JournalEntry("/learner/policy", values, sent)

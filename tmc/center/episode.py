@@ -21,9 +21,9 @@ from tmc.kernel.uncertainty import merge, step_events
 from tmc.kernel.world import World
 from tmc.wire.messages import EMPTY, Begin, Map, Record
 
-GONE = 65_535
+NO_CELL = 65_535
 """Stands for the cell of a UAV that was lost, in the ticks after its last record."""
-SOME = 64
+MAX_TICKS_AT_ONCE = 64
 """Ticks that are reckoned at once, at most."""
 _UAV = int(Block.UAV)
 
@@ -33,7 +33,7 @@ class RefusedError(ValueError):
 
 
 @dataclass(frozen=True)
-class Truth:
+class FinalTicks:
     """What became final, one entry a tick from `first` on: sum_k u_k, the UAVs that were there and the mean of their
     rewards; and the events (tick, cell)."""
 
@@ -59,17 +59,17 @@ class Exchange:
     active: NDArray[np.uint16]
 
 
-class Flight:
+class EpisodeState:
     """The state of one episode. `version` numbers the maps of the whole mission, on from episode to episode."""
 
-    def __init__(self, world: World, reward: RewardLaw, replay: Replay, episode: int, version: int) -> None:
+    def __init__(self, world: World, reward: RewardLaw, replay: Replay, number: int, version: int) -> None:
         config = world.config
-        self.world, self.reward, self.replay, self.episode = world, reward, replay, episode
+        self.world, self.reward, self.replay, self.number = world, reward, replay, number
         self._rules = config.reward
         self.T, self.N = config.training.ticks, config.team.size
         self.scenario = config.scenario
-        self.starts = world.starts(episode)
-        self.factor = world.initial_factor(episode)
+        self.starts = world.starts(number)
+        self.factor = world.initial_factor(number)
         self._due = [[i for i in range(self.N) if config.phase(i) == p] for p in range(config.T_u)]
         K, R = world.grid.size, world.law.cells.size
         self.cells = np.zeros((self.T + 1, self.N), "<u2")
@@ -77,9 +77,9 @@ class Flight:
         self.blocks = np.zeros((self.T + 1, self.N), "u1")
         self.own_rewards = np.zeros((self.T + 1, self.N), "<f4")
         self.base = np.zeros((self.T + 1, self.N), np.int64)
-        self._values = np.full((self.T + 1, self.N, 2), np.nan, "<f4") if config.replay.priority else None
+        self._values = np.full((self.T + 1, self.N, 2), np.nan, "<f4") if config.replay.priority_exponent else None
         """Q(o_t, a_t) and max_a Q(o_t, a), by the tick t of the decision, as the UAVs reckoned them."""
-        self._judged = 0
+        self._prioritised = 0
         self.reported = [-1] * self.N
         self.lost: dict[int, int] = {}
         """Lost UAVs, and the tick of their last record."""
@@ -100,7 +100,7 @@ class Flight:
         self.rewards = np.zeros((self.T + 1, self.N), "<f4")
         self.total_reward = [0.0] * self.N
         self.blocked = dict.fromkeys((Block.GRID, Block.OBSTACLE, Block.UAV), 0)
-        self._fresh = Truth(0, [], [], [], [])
+        self._fresh = FinalTicks(0, [], [], [], [])
         self.base[:] = replay.add_frame(0, np.zeros(R, "u2"))
 
     @property
@@ -140,7 +140,7 @@ class Flight:
         moves = r.tick - max(r.first, 1) + 1
         if not (r.cells.size == r.tick - r.first + 1 and r.actions.size == r.blocks.size == r.rewards.size == moves):
             raise RefusedError(f"record of UAV {r.uav} has arrays that do not match its ticks {r.first}..{r.tick}")
-        valued = self._values is not None and self.world.config.team.pilot == "policy"
+        valued = self._values is not None and self.world.config.team.controller == "policy"
         if r.values.size != (2 * moves if valued else 0):
             raise RefusedError(f"record of UAV {r.uav} has {r.values.size} values of {moves} moves: two each, or none")
         self._check_path(r)
@@ -200,7 +200,7 @@ class Flight:
     def _exchange(self, t: int, due: list[int]) -> Exchange:
         self.version += 1
         if self.scenario == 1:
-            self._settle(t)
+            self._finalise(t)
             self.base[t : t + 2] = self.replay.add_frame(t, self.active[self.world.law.cells])
             active = np.flatnonzero(self.active).astype("<u2")
             return Exchange(t, self.version, due, float(active.size), EMPTY, active)
@@ -227,42 +227,42 @@ class Flight:
     def answer(self, exchange: Exchange, policy: int, sequence: int, acknowledged: int) -> Map:
         """The TMC's answer at an exchange to record `sequence`; those below `acknowledged` are journalled for good."""
         last_visit, active = exchange.last_visit, exchange.active
-        return Map(self.episode, exchange.tick, exchange.version, policy, sequence, acknowledged, last_visit, active)
+        return Map(self.number, exchange.tick, exchange.version, policy, sequence, acknowledged, last_visit, active)
 
     def begin(self, i: int, policy: int, sequence: int) -> Begin:
         """Fly from the last record that the TMC has of UAV i; at the start of the episode, from its beginning."""
         shipped, lost, tick = self.reported[i], np.array([*self.lost], "<u2"), max(self.reported[i], 0)
         belief, track = self.beliefs[i].copy(), self.cells[: tick + 1, i].copy()
-        return Begin(self.episode, tick, shipped, sequence, self.given[i], policy, belief, track, lost)
+        return Begin(self.number, tick, shipped, sequence, self.given[i], policy, belief, track, lost)
 
     def uncertainty(self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """u_k(t) over the monitored cells, scenario II; shapes as in `UncertaintyLaw.values`."""
         return self.world.law.values(last_visit, t, self.factor)
 
-    def settle(self) -> Truth:
+    def finalise(self) -> FinalTicks:
         """Run the truth clock up to the slowest UAV; returns what became final since the last call."""
-        self._settle(min((t for i, t in enumerate(self.reported) if i not in self.lost), default=self.T))
-        truth, self._fresh = self._fresh, Truth(self.done + 1, [], [], [], [])
+        self._finalise(min((t for i, t in enumerate(self.reported) if i not in self.lost), default=self.T))
+        truth, self._fresh = self._fresh, FinalTicks(self.done + 1, [], [], [], [])
         ticks = slice(truth.first, self.done + 1)
         if truth.uncertainty:
             sure = [self._sure(t) for t in range(truth.first, self.done + 1)]
             rows = (self.cells[ticks], self.actions[ticks], self.rewards[ticks], self.base[ticks])
-            self.replay.add_rows(self.episode, truth.first, *rows, sure)
+            self.replay.add_rows(self.number, truth.first, *rows, sure)
             if self._values is not None:
-                self._judge(self._values)
+                self._set_initial_priorities(self._values)
         return truth
 
-    def _judge(self, values: NDArray[np.float32]) -> None:
+    def _set_initial_priorities(self, values: NDArray[np.float32]) -> None:
         """First priorities (Horgan et al. 2018, Sec. 3) of the transitions for which the values are final by now.
 
         A transition from t needs max_a Q(o_{t+1}, a), which comes with the move from t + 1: the last one of an episode
         has none. With n-step sums the 1-step error stands for that of the whole transition.
         """
-        dqn, first = self.world.config.dqn, self._judged
-        self._judged = self.T - 1 if self.done == self.T else max(self.done + 1 - max(2, dqn.n_step), first)
-        ticks, following = slice(first, self._judged), slice(first + 1, self._judged + 1)
+        dqn, first = self.world.config.dqn, self._prioritised
+        self._prioritised = self.T - 1 if self.done == self.T else max(self.done + 1 - max(2, dqn.n_step), first)
+        ticks, following = slice(first, self._prioritised), slice(first + 1, self._prioritised + 1)
         errors = first_errors(dqn.reward_scale * self.rewards[following], values[ticks], dqn.gamma, values[following])
-        self.replay.judge(self.replay.rows_in - 1 - self.done + first, errors)
+        self.replay.set_initial_errors(self.replay.rows_in - 1 - self.done + first, errors)
 
     def _sure(self, t: int) -> bool:
         """False for the ticks at which nobody knows whom a lost UAV was seen by: until its next exchange it may have
@@ -273,7 +273,7 @@ class Flight:
     def lose(self, uav: int) -> int:
         """Go on without a UAV: its visits count up to its last record, the tick of which is returned."""
         last = self.lost[uav] = self.reported[uav]
-        self.cells[last + 1 :, uav] = GONE
+        self.cells[last + 1 :, uav] = NO_CELL
         return last
 
     def digest(self) -> str:
@@ -283,13 +283,13 @@ class Flight:
 
     def present(self, t: int) -> list[tuple[int, int]]:
         """(uav, cell) of those who were not lost at tick t."""
-        return [(i, cell) for i, cell in enumerate(self.cells[t].tolist()) if cell != GONE]
+        return [(i, cell) for i, cell in enumerate(self.cells[t].tolist()) if cell != NO_CELL]
 
-    def _settle(self, upto: int) -> None:
+    def _finalise(self, upto: int) -> None:
         while self.done < upto:
-            self._settle_some(range(self.done + 1, min(self.done + SOME, upto) + 1))
+            self._finalise_ticks(range(self.done + 1, min(self.done + MAX_TICKS_AT_ONCE, upto) + 1))
 
-    def _settle_some(self, ticks: range) -> None:
+    def _finalise_ticks(self, ticks: range) -> None:
         """These ticks are final; the map's uncertainty is reckoned for all of them at once."""
         fresh, maps = self._fresh, np.empty((len(ticks), self.last_visit.size), "<u2")
         sums = []
@@ -344,7 +344,7 @@ class Flight:
     def _events(self, t: int, present: list[tuple[int, int]]) -> float:
         """Scenario I: what was visited is cleared and the events of the slot come in; sum_k e_k(t)."""
         if t:
-            arrivals = self.world.arrivals(self.episode, t)
+            arrivals = self.world.arrivals(self.number, t)
             self.active, new = step_events(self.active, [cell for _, cell in present], arrivals)
             self._fresh.events.extend((t, int(k)) for k in new)
         return float(self.active.sum())

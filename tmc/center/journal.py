@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tmc.center.entries import Entry
+from tmc.center.entries import JournalEntry
 from tmc.center.roster import Outbox
 from tmc.kernel.config import flat
 from tmc.kernel.world import World
@@ -28,8 +28,8 @@ _SCHEMA = {c.topic: c.schema for c in CHANNELS}
 class Journal:
     """The file `tmc.mcap` of a run: config and map as attachments, then one message an entry.
 
-    `resume`: go on with the journal that an earlier life of the TMC left in the folder, if it left one (`found`).
-    `timer`: a clock in s that is never set.
+    `resume`: go on with the journal that an earlier incarnation of the TMC left in the folder, if it left one
+    (`found`). `timer`: a clock in s that is never set.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Journal:
         if not self.found:
             self._begin(world)
         else:  # the writer has synced what it took over
-            self._swear()
+            self._append_ack()
 
     def _begin(self, world: World) -> None:
         config = json.dumps(flat(world.config), indent=1)
@@ -75,19 +75,19 @@ class Journal:
         """Seconds until the entries that are not committed must be; None when all are."""
         if self._since is None:
             return None
-        return max(0.0, self._since + self.world.config.journal.commit - time.monotonic())
+        return max(0.0, self._since + self.world.config.journal.commit_interval - time.monotonic())
 
     def commit(self) -> None:
         """Hand over all entries so far: to the system, or to the disk."""
         self.writer.flush(fsync=self.world.config.journal.durability == "power")
         self._since = None
-        self._swear()
+        self._append_ack()
 
-    def _swear(self) -> None:
+    def _append_ack(self) -> None:
         """In a trial with power cuts: how much of which file the disk has, for whoever simulates them."""
         config = self.world.config
-        if config.trial.oath and config.journal.durability == "power":
-            path = self.folder / "oaths" / "tmc.txt"
+        if config.trial.ack_log and config.journal.durability == "power":
+            path = self.folder / "acks" / "tmc.txt"
             path.parent.mkdir(exist_ok=True)
             now = self.writer.active.stat()
             with path.open("a", encoding="utf-8") as file:
@@ -103,7 +103,7 @@ class Journal:
             policy_path(self.folder, version).unlink(missing_ok=True)
         self._policies, self._stale = set(held), set()
 
-    def _message(self, entry: Entry) -> Any:
+    def _message(self, entry: JournalEntry) -> Any:
         if "record" in entry.values:
             return builders.flight_record(entry.values["record"])
         if entry.topic == "/tmc/last_visit":

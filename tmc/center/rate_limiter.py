@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass
-class Limiter:
+class RateLimiter:
     """Counts ticks of the team (inserts) and minibatches (samples) since learning could start.
 
     `ratio` minibatches are owed a tick. Samples never exceed what is owed; inserts are held back while more than
@@ -28,7 +28,7 @@ class Limiter:
             self.origin = self.ticks
 
     @property
-    def owed(self) -> int:
+    def samples_due(self) -> int:
         """Minibatches that may be drawn now."""
         if self.origin is None:
             return 0
@@ -40,12 +40,12 @@ class Limiter:
         return (self.origin or 0) + math.ceil((self.updates + 1) / self.ratio)
 
     @property
-    def may_insert(self) -> bool:
+    def can_insert(self) -> bool:
         """False while the learner is so far behind that the UAVs must wait for it."""
-        return self.owed <= self.slack * self.ratio
+        return self.samples_due <= self.slack * self.ratio
 
     def sample(self) -> None:
         """A minibatch was drawn; asking for one that is not owed is a mistake of the caller."""
-        if self.owed < 1:
+        if self.samples_due < 1:
             raise ValueError("no minibatch is owed: the learner must wait for the UAVs")
         self.updates += 1

@@ -14,7 +14,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from tmc.center.entries import Entry
+from tmc.center.entries import JournalEntry
 from tmc.center.episode import RefusedError
 from tmc.center.journal import policy_path
 from tmc.center.roster import Member
@@ -30,7 +30,7 @@ Taker = Callable[[Station, Any, Path, float], None]
 EPISODE, POLICY = "overfly.Episode", "overfly.Policy"
 
 
-def recover(station: Station, path: Path, now: float) -> list[Entry]:
+def recover(station: Station, path: Path, now: float) -> list[JournalEntry]:
     """Bring a new station to the state that the journal at `path` tells of; returns what is missing in the journal.
 
     RecordError when the journal contradicts itself.
@@ -39,9 +39,9 @@ def recover(station: Station, path: Path, now: float) -> list[Entry]:
     missing = play(station, log.raw(), path.parent, now, skipped(log, station.config))
     for i, member in enumerate(station.roster):
         member.heard = now
-        if station.flight is not None and member.life < 0 and i not in station.flight.lost:
-            member.life = 0  # it has flown nothing yet, so its process is not known: it may be silent for ever
-    station.feed.recovered = True
+        if station.episode is not None and member.incarnation < 0 and i not in station.episode.lost:
+            member.incarnation = 0  # it has flown nothing yet, so its process is not known: it may be silent for ever
+    station.sample_queue.recovered = True
     station.committed()
     station.out.take()
     return missing
@@ -53,8 +53,8 @@ def play(
     folder: Path,
     now: float,
     skip: range = range(0),
-    watch: Callable[[list[Entry]], None] = lambda _: None,
-) -> list[Entry]:
+    watch: Callable[[list[JournalEntry]], None] = lambda _: None,
+) -> list[JournalEntry]:
     """Play the messages of a journal; returns the entries that follow from them and are not among them.
 
     `folder` holds the policy files; of the episodes in `skip` only the sums are taken; `watch` is given all entries.
@@ -77,7 +77,7 @@ def play(
             if message is not None:
                 _take(_SUMS if skipping else _TAKERS, station, message, folder, now)
                 keep()
-        station.settle()
+        station.finalise()
         keep()
     finally:
         station.playing = False
@@ -98,7 +98,7 @@ class _Balance:
 
     def __init__(self) -> None:
         self._written: Counter[str] = Counter()
-        self._made: dict[str, deque[tuple[int, Entry]]] = {}
+        self._made: dict[str, deque[tuple[int, JournalEntry]]] = {}
         self._count = 0
 
     def written(self, topic: str) -> None:
@@ -107,7 +107,7 @@ class _Balance:
         else:
             self._written[topic] += 1
 
-    def made(self, entries: list[Entry]) -> None:
+    def made(self, entries: list[JournalEntry]) -> None:
         for entry in entries:
             self._count += 1
             if self._written[entry.topic]:
@@ -115,7 +115,7 @@ class _Balance:
             else:
                 self._made.setdefault(entry.topic, deque()).append((self._count, entry))
 
-    def missing(self) -> list[Entry]:
+    def missing(self) -> list[JournalEntry]:
         """What was made and is not written, in its order."""
         left = sorted((item for made in self._made.values() for item in made), key=lambda item: item[0])
         return [entry for _, entry in left]
@@ -148,8 +148,8 @@ def _sum_episode(station: Station, message: Any, _folder: Path, _now: float) -> 
     blocked = (message.blocked_grid, message.blocked_obstacle, message.blocked_uav)
     station.episodes, station.steps = message.episode, message.steps
     station.ticks += message.ticks
-    station.limiter.ticks += message.ticks
-    station.limiter.updates = message.updates
+    station.rate_limiter.ticks += message.ticks
+    station.rate_limiter.updates = message.updates
     station.blocked += sum(blocked)
     station.blocked_by_uav += message.blocked_uav
 
@@ -166,7 +166,7 @@ def _sum_sync(station: Station, message: Any, _folder: Path, _now: float) -> Non
 
 
 def _in_turn(station: Station, message: Any) -> None:
-    if station.flight is not None or station.episodes != message.episode - 1:
+    if station.episode is not None or station.episodes != message.episode - 1:
         raise RecordError(f"the journal has episode {message.episode} out of turn: do not go on with it")
 
 
@@ -177,31 +177,31 @@ def _next_of(station: Station, message: Any, now: float) -> Member:
         text = f"the journal has record {message.sequence} of UAV {message.uav} out of turn: do not go on with it"
         raise RecordError(text)
     member: Member = team[message.uav]
-    member.live(message.life, now)
+    member.heard_from(message.incarnation, now)
     return member
 
 
 def _episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
-    begun = station.flight is not None and station.flight.episode == message.episode
+    begun = station.episode is not None and station.episode.number == message.episode
     if message.phase == "begin" and not begun:
         _in_turn(station, message)
         station.begin_episode([])
     elif message.phase == "end":
-        station.settle()
+        station.finalise()
 
 
 def _record(station: Station, message: Any, _folder: Path, now: float) -> None:
-    record, flight = to_record(message), station.flight
+    record, episode = to_record(message), station.episode
     _next_of(station, message, now)
-    if flight is None or record.episode != flight.episode:
+    if episode is None or record.episode != episode.number:
         raise RecordError(f"the journal has a record of episode {record.episode} out of turn: do not go on with it")
-    station.accept(flight, record)
+    station.accept(episode, record)
 
 
 def _lost(station: Station, message: Any, _folder: Path, _now: float) -> None:
-    flight, uav = station.flight, message.uav
-    if flight is not None and uav < flight.N and uav not in flight.lost:
-        station.lose(flight, uav)
+    episode, uav = station.episode, message.uav
+    if episode is not None and uav < episode.N and uav not in episode.lost:
+        station.lose(episode, uav)
 
 
 def _policy(station: Station, message: Any, folder: Path, _now: float) -> None:
@@ -219,8 +219,8 @@ def _model(message: Any, folder: Path) -> bytes:
 
 
 def _metrics(station: Station, message: Any, _folder: Path, _now: float) -> None:
-    station.settle()  # here the TMC did; in between it may have taken any number of records
-    station.limiter.updates = message.updates
+    station.finalise()  # here the TMC did; in between it may have taken any number of records
+    station.rate_limiter.updates = message.updates
 
 
 _TAKERS: dict[str, Taker] = {

@@ -27,11 +27,11 @@ def beacon(station: Station, sender: str, message: m.Beacon, _now: float) -> Non
 
 def loss(station: Station, i: int, to: Iterable[int]) -> None:
     """Tell the UAVs `to` that the team goes on without UAV i."""
-    flight = station.flight
-    assert flight is not None
+    episode = station.episode
+    assert episode is not None
     for j in to:
         tracks(station, j, [i])
-        station.send(uav_name(j), m.Lost(flight.episode, i, flight.lost[i]))
+        station.send(uav_name(j), m.Lost(episode.number, i, episode.lost[i]))
 
 
 def tracks(station: Station, j: int, lost: Iterable[int]) -> None:
@@ -39,12 +39,12 @@ def tracks(station: Station, j: int, lost: Iterable[int]) -> None:
 
     Before what tells of a loss, since from then on j does not wait for what it does not know.
     """
-    flight = station.flight
-    assert flight is not None
+    episode = station.episode
+    assert episode is not None
     for i in lost:
-        cells = flight.cells[1 : flight.lost[i] + 1, i].copy()
+        cells = episode.cells[1 : episode.lost[i] + 1, i].copy()
         if cells.size and not station.tracks:
-            station.send(uav_name(j), m.Beacon(i, flight.episode, 1, cells, np.array([j], "<u2")))
+            station.send(uav_name(j), m.Beacon(i, episode.number, 1, cells, np.array([j], "<u2")))
 
 
 def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
@@ -55,14 +55,16 @@ def alive(station: Station, sender: str, message: m.Alive, now: float) -> None:
     """
     if not 0 <= message.uav < len(station.roster) or sender != uav_name(message.uav):
         return
-    member, flight = station.roster[message.uav], station.flight
-    if message.life == member.life:
+    member, episode = station.roster[message.uav], station.episode
+    if message.incarnation == member.incarnation:
         member.heard, member.named = now, False
-        if flight is not None and message.peer in flight.lost:  # it waits for one of whose loss it has not heard
+        if episode is not None and message.peer in episode.lost:  # it waits for one of whose loss it has not heard
             loss(station, message.peer, [message.uav])
-    elif message.life in member.past:
+    elif message.incarnation in member.former:
         return  # another process flies it now
-    if message.life != member.life or message.sequence > member.sequence + station.early.count(message.uav):
+    if message.incarnation != member.incarnation or message.sequence > member.sequence + station.reorder_buffer.count(
+        message.uav
+    ):
         station.reject(sender, "state", f"{sender} has flown on from what is not known here: say hello")
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tmc.center.priorities import Priorities
 from tmc.kernel.draws import Stream, uniforms
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Floats, Ints, Observer, Views
+from tmc.kernel.observation import Floats, Ints, ObservationBuilder, Views
 from tmc.kernel.world import World
 
 
@@ -57,7 +57,7 @@ class Ring:
 class Replay:
     """Holds the newest `replay.capacity` transitions of a mission; pure: rows in, minibatches out."""
 
-    def __init__(self, world: World, observer: Observer) -> None:
+    def __init__(self, world: World, observer: ObservationBuilder) -> None:
         config = world.config
         self.world, self.observer = world, observer
         self.n_step, self.gamma = config.dqn.n_step, config.dqn.gamma
@@ -82,8 +82,8 @@ class Replay:
         """Where cell k stands among the monitored ones, R where it does not. Shape (K + 1,)."""
         self.priorities: Priorities | None = None
         """By the number of a transition, place * N + UAV; None where all are equally likely."""
-        if config.replay.priority:
-            self.priorities = Priorities(self._starts_kept * team, config.replay.priority)
+        if config.replay.priority_exponent:
+            self.priorities = Priorities(self._starts_kept * team, config.replay.priority_exponent)
 
     def __len__(self) -> int:
         """Transitions that can be drawn."""
@@ -167,7 +167,7 @@ class Replay:
         if self.priorities is not None:
             self.priorities.add(self._present(np.array(ends, np.int64)).ravel())
 
-    def judge(self, row: int, errors: NDArray[np.float64]) -> None:
+    def set_initial_errors(self, row: int, errors: NDArray[np.float64]) -> None:
         """|TD error|, shape (n, N), of the transitions that start in the rows from `row` on; NaN where not known."""
         assert self.priorities is not None
         newest = min(self.starts_in, self._starts_kept, self.rows_in - row)  # every row has one start at most
@@ -211,7 +211,7 @@ class Replay:
         u = uniforms(self.world.config.training.seed, Stream.REPLAY, 2 * batch, tick=number)
         if self.priorities is not None and self.priorities.total > 0.0:
             index = self.priorities.draw(u[:batch])
-            weight = self.priorities.weights(index, self.world.config.replay.correction)
+            weight = self.priorities.weights(index, self.world.config.replay.importance_exponent)
             return self.rebuild(*np.divmod(index, self.world.config.team.size), weight)
         held = self.starts_in - self._oldest
         place = self._oldest + (u[:batch] * held).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Who takes part in a mission, as the TMC knows them, and what the TMC has for them."""
+"""PolicySpec takes part in a mission, as the TMC knows them, and what the TMC has for them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Outbox:
     """What the core wants done: messages to send, entries to journal, notes for the log. The service empties it."""
 
     sends: list[tuple[str, m.Message]] = field(default_factory=list)
-    entries: list[entries.Entry] = field(default_factory=list)
+    entries: list[entries.JournalEntry] = field(default_factory=list)
     notes: list[tuple[str, str]] = field(default_factory=list)
 
     def take_sends(self) -> list[tuple[str, m.Message]]:
@@ -43,14 +43,15 @@ class Outbox:
 
 @dataclass
 class Member:
-    """A UAV on the roster: its process's life, the lives before it, when it was last heard of, its last answer.
+    """A UAV on the roster: its process's incarnation, the incarnations before it, when it was last heard of, its last
+    answer.
 
     `sequence`: of its next record; `durable`: its records below this number are in the journal for good; `policy`: the
     version that it was told to fly. Its next process flies that too: peers may have seen what the last one flew.
     """
 
-    life: int = -1
-    past: set[int] = field(default_factory=set)
+    incarnation: int = -1
+    former: set[int] = field(default_factory=set)
     heard: float = 0.0
     sequence: int = 0
     durable: int = 0
@@ -58,18 +59,18 @@ class Member:
     answer: m.Map | None = None
     named: bool = False
 
-    def live(self, life: int, now: float) -> bool:
-        """Heard at `now` of the process `life`; True when it takes the place of another one."""
-        new = self.life not in {-1, life}
+    def heard_from(self, incarnation: int, now: float) -> bool:
+        """Heard at `now` of the process `incarnation`; True when it takes the place of another one."""
+        new = self.incarnation not in {-1, incarnation}
         if new:
-            self.past.add(self.life)
-        self.life, self.heard, self.named = life, now, False
+            self.former.add(self.incarnation)
+        self.incarnation, self.heard, self.named = incarnation, now, False
         return new
 
 
 def away(members: list[Member]) -> list[int]:
     """UAVs without a process."""
-    return [i for i, member in enumerate(members) if member.life < 0]
+    return [i for i, member in enumerate(members) if member.incarnation < 0]
 
 
 def name_some(names: list[str]) -> str:
@@ -87,7 +88,7 @@ def silent(members: list[Member], now: float, patience: float) -> list[int]:
 
 def long_silent(members: list[Member], now: float, patience: float) -> list[int]:
     """UAVs with a process that was not heard of for `patience` seconds."""
-    return [i for i, m in enumerate(members) if m.life >= 0 and now - m.heard > patience]
+    return [i for i, m in enumerate(members) if m.incarnation >= 0 and now - m.heard > patience]
 
 
 def excuse(members: list[Member], pause: float, now: float) -> None:
@@ -101,22 +102,22 @@ Problem = tuple[str, str] | None
 
 
 def hello_problem(members: list[Member], sender: str, hello: m.Hello) -> Problem:
-    """Why a UAV cannot say hello: another name than its own, or a life that a newer one took the place of."""
+    """Why a UAV cannot say hello: another name than its own, or an incarnation that a newer one took the place of."""
     if not 0 <= hello.uav < len(members) or sender != uav_name(hello.uav):
         return "refused", f"{sender} is no name for UAV {hello.uav} of a team of {len(members)}"
-    if hello.life in members[hello.uav].past:
+    if hello.incarnation in members[hello.uav].former:
         return "fenced", f"a newer process flies {sender}: leave"
     return None
 
 
 def record_problem(members: list[Member], sender: str, record: m.Record) -> Problem:
-    """Why a UAV cannot ship a record: not its own, not known here, or of an older life."""
+    """Why a UAV cannot ship a record: not its own, not known here, or of an older incarnation."""
     if not 0 <= record.uav < len(members) or sender != uav_name(record.uav):
         return "refused", f"{sender} cannot ship a record of UAV {record.uav}"
-    if members[record.uav].life < 0:
+    if members[record.uav].incarnation < 0:
         return "state", f"{sender} is not known here: say hello first"
-    if record.life in members[record.uav].past:
+    if record.incarnation in members[record.uav].former:
         return "fenced", f"a newer process flies {sender}: leave"
-    if record.life != members[record.uav].life:  # it said hello to an earlier life of the TMC
+    if record.incarnation != members[record.uav].incarnation:  # it said hello to an earlier incarnation of the TMC
         return "state", f"this process of {sender} is not known here: say hello first"
     return None

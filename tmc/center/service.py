@@ -18,21 +18,21 @@ from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError, decode
 from tmc.wire.messages import Begin, Bye, End, Lost, Map, Message, PolicyPush, Welcome
 
-BURST = 64
+MESSAGES_PER_POLL = 64
 """Messages taken from one socket before the other has its turn."""
-REST = 0.01
+BATCH_DELAY_S = 0.01
 """Seconds that book-keeping waits for more of its kind: a dozen records in a row cost a third of one at a time, since
 the processor has the code at hand."""
-PAUSE = 1.0
+STALL_THRESHOLD_S = 1.0
 """Seconds from one turn of the loop to the next from which on nobody is blamed for them."""
-FAREWELL = 60.0
+SHUTDOWN_TIMEOUT_S = 60.0
 """Seconds that the TMC waits for the last client to leave once the mission is over."""
-REUNION = 3.0
+RECONNECT_WINDOW_S = 3.0
 """Seconds that a TMC that was started again waits to hear of clients that do not know yet that the mission is over."""
 
-LEAD = 100
+MAX_TICKS_UNCOMMITTED = 100
 """Ticks by which answers are ahead of the journal at most, in a training. So a TMC that was started again knows up to
-which tick its last life may have answered: up to there it names the policy that that one named."""
+which tick its last incarnation may have answered: up to there it names the policy that that one named."""
 
 
 def binds(message: Message) -> bool:
@@ -51,7 +51,7 @@ class Service:
         self.station, self.journal, self.endpoint = station, journal, endpoint
         self.context: zmq.Context[Any] = zmq.Context()
         self.sync = sockets.router(self.context, endpoint)
-        self.feed = sockets.router(self.context, sockets.feed_endpoint(endpoint))
+        self.learner_socket = sockets.router(self.context, sockets.learner_endpoint(endpoint))
         self._where: dict[str, tuple[zmq.Socket[Any], bytes]] = {}
         self._here: set[str] = set()
         self._expected = set[str]()
@@ -63,18 +63,18 @@ class Service:
         """The policy that each UAV was last told to fly; all of that is committed."""
         self._answered = self._committed = 0
         """Up to when UAVs were answered, and up to when that is committed; see `_when`."""
-        self._free = self._reached() + LEAD if journal.found else 0
+        self._free = self._reached() + MAX_TICKS_UNCOMMITTED if journal.found else 0
         """Up to when UAVs must have been answered before a newer policy is taken."""
         self._waiting: PolicyPush | None = None
         self._ticked = time.monotonic()
         self._reminder = process.Reminder()
-        self._unsettled: float | None = None
+        self._unjournalled_since: float | None = None
         """When the oldest entry came that is not journalled, seconds of the monotonic clock."""
 
     def serve(self, stop: Callable[[], bool]) -> bool:
         """The main loop. True when the mission came to its end, False when it was stopped."""
         poller = zmq.Poller()
-        for sock in (self.sync, self.feed):
+        for sock in (self.sync, self.learner_socket):
             poller.register(sock, zmq.POLLIN)
         while not stop():
             for sock, _ in poller.poll(self._patience()):
@@ -82,7 +82,7 @@ class Service:
             self._tick()
             self._take_waiting()
             self._send()
-            self._settle()
+            self._finalise()
             self._remind()
             self.journal.writer.maybe_flush()
             if self._finished():
@@ -95,7 +95,7 @@ class Service:
     def _tick(self) -> None:
         """Count the UAVs' silence, without the time in which this process was stopped, or waited for a slow disk."""
         now, then = time.monotonic(), self._ticked
-        if now - then > PAUSE:
+        if now - then > STALL_THRESHOLD_S:
             roster.excuse(self.station.roster, now - then, now)
         self._ticked = now
         self.station.tick(now)
@@ -103,7 +103,9 @@ class Service:
     def _remind(self) -> None:
         """Say for what the mission waits, where it has not gone on for some seconds."""
         station = self.station
-        if self._reminder.due((station.phase, station.ticks, station.limiter.updates)) and (text := self._waits_for()):
+        if self._reminder.due((station.phase, station.ticks, station.rate_limiter.updates)) and (
+            text := self._waits_for()
+        ):
             process.note(text)
 
     def _waits_for(self) -> str:
@@ -114,16 +116,20 @@ class Service:
 
     def _patience(self) -> int:
         """Milliseconds to wait for a message; not so long that a silence would be seen late."""
-        due = self.journal.due if self._unsettled is None else self._unsettled + REST - time.monotonic()
+        due = (
+            self.journal.due
+            if self._unjournalled_since is None
+            else self._unjournalled_since + BATCH_DELAY_S - time.monotonic()
+        )
         return 100 if due is None else min(100, max(0, math.ceil(1000 * due)))
 
-    def _settle(self) -> None:
+    def _finalise(self) -> None:
         """The book-keeping that nobody waits for, and a group commit where one is due; only then are records
         acknowledged, with the answers to later ones."""
-        station, since, due = self.station, self._unsettled, self._commit_due()
-        if since is not None and (due or station.settle_now or time.monotonic() - since >= REST):
-            self._unsettled = None
-            station.settle()
+        station, since, due = self.station, self._unjournalled_since, self._commit_due()
+        if since is not None and (due or station.finalise_now or time.monotonic() - since >= BATCH_DELAY_S):
+            self._unjournalled_since = None
+            station.finalise()
             self._send()
             self._write()
             due = self._commit_due()
@@ -148,7 +154,7 @@ class Service:
         return due == 0.0 or (due is not None and self.station.phase == "done")
 
     def _drain(self, sock: zmq.Socket[Any]) -> None:
-        for _ in range(BURST):
+        for _ in range(MESSAGES_PER_POLL):
             frames = sockets.receive(sock)
             if frames is None:
                 return
@@ -170,7 +176,11 @@ class Service:
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
-        if isinstance(message, PolicyPush) and sender == LEARNER and message.life not in self.station.feed.past:
+        if (
+            isinstance(message, PolicyPush)
+            and sender == LEARNER
+            and message.incarnation not in self.station.sample_queue.former
+        ):
             self._waiting = message  # in the place of one that may wait
             self._take_waiting()
         else:
@@ -184,7 +194,8 @@ class Service:
 
     @property
     def _may_change(self) -> bool:
-        """False while exchanges may be repeated that an earlier life has answered: the same policy must be named then.
+        """False while exchanges may be repeated that an earlier incarnation has answered: the same policy must be named
+        then.
 
         True whenever that policy is not at hand, or none will be named any more.
         """
@@ -194,10 +205,10 @@ class Service:
 
     def _reached(self) -> int:
         """When the next exchange is."""
-        flight = self.station.flight
-        if flight is None:
+        episode = self.station.episode
+        if episode is None:
             return self._when(self.station.episodes + 1, 0)
-        return self._when(flight.episode, flight.next_exchange)
+        return self._when(episode.number, episode.next_exchange)
 
     def _when(self, episode: int, tick: int) -> int:
         """Ticks since the mission began, each episode's last one counted."""
@@ -207,13 +218,16 @@ class Service:
         """Send what the station has for others. The journal can wait, since only what is committed is acknowledged, and
         `_secure` has seen to the policies."""
         out = self.station.out
-        if self._unsettled is None and (out.entries or out.notes):
-            self._unsettled = time.monotonic()
+        if self._unjournalled_since is None and (out.entries or out.notes):
+            self._unjournalled_since = time.monotonic()
         sends = out.take_sends()
         self._secure(sends)
         for name, message in sends:
-            # Who was not heard yet may have been connected to an earlier life of this process.
-            sock, identity = self._where.get(name) or (self.feed if name == LEARNER else self.sync, name.encode())
+            # PolicySpec was not heard yet may have been connected to an earlier incarnation of this process.
+            sock, identity = self._where.get(name) or (
+                self.learner_socket if name == LEARNER else self.sync,
+                name.encode(),
+            )
             sockets.send(sock, message, identity)
             if isinstance(message, Welcome):  # one that was refused is not waited for
                 self._here.add(name)
@@ -229,7 +243,7 @@ class Service:
         answers = [(name, message) for name, message in sends if isinstance(message, Begin | Map)]
         told = {name: answer.policy for name, answer in answers}
         self._answered = max([self._answered, *(self._when(a.episode, a.tick) for _, a in answers)])
-        ahead = self.station.learning and self._answered > self._committed + LEAD
+        ahead = self.station.learning and self._answered > self._committed + MAX_TICKS_UNCOMMITTED
         changes = any(self._flies.get(name, 0) != policy for name, policy in told.items())
         if ahead or changes or any(binds(message) for _, message in sends):
             self._write()
@@ -243,7 +257,7 @@ class Service:
             return False
         now = time.monotonic()
         self._over = self._over or now
-        return now - self._over >= max(FAREWELL * bool(self._here), REUNION * bool(self._expected))
+        return now - self._over >= max(SHUTDOWN_TIMEOUT_S * bool(self._here), RECONNECT_WINDOW_S * bool(self._expected))
 
     def _say_goodbye(self, reason: str) -> None:
         for sock, identity in self._where.values():
@@ -257,6 +271,6 @@ class Service:
     def close(self) -> None:
         """Close the sockets and the journal."""
         self.context.destroy(linger=200)
-        for endpoint in (self.endpoint, sockets.feed_endpoint(self.endpoint)):
+        for endpoint in (self.endpoint, sockets.learner_endpoint(self.endpoint)):
             sockets.unlink(endpoint)
         self.journal.writer.close()

@@ -1,7 +1,7 @@
 """The traffic management centre as a core without I/O: a message comes in, messages, journal entries and notes go out.
 
-It holds the roster, the flight of the current episode, the replay memory, the limiter and the newest policy. Time is an
-argument and randomness is addressed, so playing the same messages again gives the same answers.
+It holds the roster, the episode of the current episode, the replay memory, the limiter and the newest policy. Time is
+an argument and randomness is addressed, so playing the same messages again gives the same answers.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from collections.abc import Callable
 from typing import Any
 
 from tmc.center import entries, relay, roster
-from tmc.center.episode import Exchange, Flight, Truth
+from tmc.center.episode import EpisodeState, Exchange, FinalTicks
 from tmc.center.policies import Policies
-from tmc.center.rate_limiter import Limiter
-from tmc.center.reorder_buffer import Early
+from tmc.center.rate_limiter import RateLimiter
+from tmc.center.reorder_buffer import ReorderBuffer
 from tmc.center.replay import Replay
 from tmc.center.roster import LEARNER, Member, Outbox, uav_name
-from tmc.center.sample_queue import REPLACED, Feed
+from tmc.center.sample_queue import REPLACED, SampleQueue
 from tmc.kernel.config import flat
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.world import World
 from tmc.wire import messages as m
@@ -35,20 +35,20 @@ class Station:
     ) -> None:
         config = world.config
         self.world, self.config, self.run, self.tracks = world, config, run, tracks
-        self.learning = learning and policy is None and config.team.pilot == "policy"
-        self.observer = Observer(world)
+        self.learning = learning and policy is None and config.team.controller == "policy"
+        self.observer = ObservationBuilder(world)
         self.replay = Replay(world, self.observer)
         self.reward = RewardLaw(config, world.law.q)
         ratio = config.replay.updates_per_tick if self.learning else 0.0
-        self.limiter = Limiter(ratio, config.replay.slack, config.replay.learn_start)
-        self.roster, self.early = [Member() for _ in range(config.team.size)], Early()
-        self.flight: Flight | None = None
+        self.rate_limiter = RateLimiter(ratio, config.replay.error_buffer, config.replay.learn_start)
+        self.roster, self.reorder_buffer = [Member() for _ in range(config.team.size)], ReorderBuffer()
+        self.episode: EpisodeState | None = None
         self.version = self.ticks = self.steps = self.episodes = self.rejected = self.blocked = self.blocked_by_uav = 0
         self.uncertainty = self.episode_uncertainty = self.loss = 0.0
         self.playing = self._ended = (
             False  # playing: a journal (tmc.center.recovery): then episodes begin where it says so
         )
-        self.feed = Feed(self.replay, self.limiter, config.dqn.batch)
+        self.sample_queue = SampleQueue(self.replay, self.rate_limiter, config.dqn.batch_size)
         self.policies, self.out = Policies(), Outbox()
         self._held: list[tuple[str, m.Message]] = []
         if policy is not None:
@@ -59,30 +59,32 @@ class Station:
     @property
     def phase(self) -> str:
         """gathering (not everybody is here), flying, learning (the learner catches up), or done."""
-        if self.flight is not None:
+        if self.episode is not None:
             return "flying"
         if self.episodes < self.config.training.episodes:
             return "gathering"
-        return "learning" if self.limiter.owed and len(self.replay) else "done"
+        return "learning" if self.rate_limiter.samples_due and len(self.replay) else "done"
 
     def waiting_for(self) -> list[str]:
-        """Who keeps the mission from going on: who is not here yet, UAVs whose record is due next, or the learner."""
-        if self.flight is None:
+        """PolicySpec keeps the mission from going on: who is not here yet, UAVs whose record is due next, or the
+        learner.
+        """
+        if self.episode is None:
             if self.phase != "gathering":
                 return []
             missing = [uav_name(i) for i in roster.away(self.roster)]
             return missing + ([LEARNER] if self.learning and not self.policies.newest else [])
-        flight, t = self.flight, self.flight.next_exchange
-        if not self.limiter.may_insert and len(self.replay):
+        episode, t = self.episode, self.episode.next_exchange
+        if not self.rate_limiter.can_insert and len(self.replay):
             return [LEARNER]  # it keeps the UAVs' answers from them
-        return [uav_name(i) for i in flight.due(t) if flight.reported[i] < t]
+        return [uav_name(i) for i in episode.due(t) if episode.reported[i] < t]
 
     # Messages in.
 
     def handle(self, sender: str, message: m.Message, now: float) -> None:
         """Take one message from `sender` at time `now`, seconds; everything that follows from it is in `out`."""
         self.answer(sender, message, now)
-        self.settle()
+        self.finalise()
 
     def answer(self, sender: str, message: m.Message, now: float) -> None:
         """As `handle`, but only what somebody may wait for; `settle` does the rest, and must be called next."""
@@ -91,16 +93,16 @@ class Station:
             self.reject(sender, "state", f"{type(message).__name__} is not a message for the TMC")
         elif isinstance(message, m.SampleRequest | m.PolicyPush) and (sender != LEARNER or not self.learning):
             self.reject(sender, "refused", f"only the learner may send a {type(message).__name__}")
-        elif isinstance(message, m.SampleRequest | m.PolicyPush) and message.life in self.feed.past:
-            self.reject(sender, *REPLACED, message.life)
+        elif isinstance(message, m.SampleRequest | m.PolicyPush) and message.incarnation in self.sample_queue.former:
+            self.reject(sender, *REPLACED, message.incarnation)
         else:
             handler(self, sender, message, now)
 
-    def reject(self, sender: str, code: str, text: str, life: int = 0) -> None:
+    def reject(self, sender: str, code: str, text: str, incarnation: int = 0) -> None:
         """Count and note a frame that changes nothing, and tell its sender what was wrong."""
         self.rejected += 1
         self.out.notes.append(("WARNING", f"rejected a frame from {sender}: {text}"))
-        self.send(sender, m.Error(code, text[:1024], life))
+        self.send(sender, m.Error(code, text[:1024], incarnation))
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))
@@ -109,25 +111,25 @@ class Station:
         if hello.role == "learner":
             if not self.learning or sender != LEARNER:
                 self.reject(sender, "refused", f"{sender} cannot be the learner of this mission, or it has none")
-            elif hello.life in self.feed.past:
-                self.reject(sender, *REPLACED, hello.life)
+            elif hello.incarnation in self.sample_queue.former:
+                self.reject(sender, *REPLACED, hello.incarnation)
             else:
-                self.feed.welcome(hello)
+                self.sample_queue.welcome(hello)
                 self.send(sender, welcome)
                 self._finish_if_done()
             return
         problem = roster.hello_problem(self.roster, sender, hello)
         if problem is not None:
-            self.reject(sender, *problem, hello.life)
+            self.reject(sender, *problem, hello.incarnation)
             return
-        if self.roster[hello.uav].live(hello.life, now):
-            self.early.drop(hello.uav)
+        if self.roster[hello.uav].heard_from(hello.incarnation, now):
+            self.reorder_buffer.drop(hello.uav)
             self.out.notes.append(("WARNING", f"{sender} is back with a new process"))
         self.send(sender, welcome)
         if self._ended:
             self.send(sender, m.End(GOODBYE, self.roster[hello.uav].durable))
-        elif self.flight is not None:
-            if hello.uav not in self.flight.lost:  # who was lost is back with the next episode
+        elif self.episode is not None:
+            if hello.uav not in self.episode.lost:  # who was lost is back with the next episode
                 self._resume(hello.uav)
         else:
             self._try_begin()
@@ -135,71 +137,71 @@ class Station:
     def _record(self, sender: str, record: m.Record, now: float) -> None:
         problem = roster.record_problem(self.roster, sender, record)
         if problem is not None:
-            self.reject(sender, *problem, record.life)
+            self.reject(sender, *problem, record.incarnation)
             return
         member = self.roster[record.uav]
         member.heard, member.named = now, False
-        flight = self.flight
-        if flight is not None and record.uav in flight.lost:
+        episode = self.episode
+        if episode is not None and record.uav in episode.lost:
             return  # too late: the others went on without it
-        following = member.sequence + self.early.count(record.uav)
+        following = member.sequence + self.reorder_buffer.count(record.uav)
         if record.sequence < following:  # a repeat: it is known, and perhaps answered
             if member.answer is not None and member.answer.sequence == record.sequence:
                 self.send(sender, member.answer)
-            elif flight is not None and record.episode < flight.episode:  # it has not heard that this one began
+            elif episode is not None and record.episode < episode.number:  # it has not heard that this one began
                 self._resume(record.uav)
-        elif flight is None or record.episode != flight.episode or record.sequence > following:
+        elif episode is None or record.episode != episode.number or record.sequence > following:
             self.reject(sender, "state", f"record {record.sequence} of {sender} is not the next one")
         else:
-            self.early.keep(record)
-            self.early.accept(self, flight)
+            self.reorder_buffer.keep(record)
+            self.reorder_buffer.accept(self, episode)
 
-    def accept(self, flight: Flight, record: m.Record) -> None:
+    def accept(self, episode: EpisodeState, record: m.Record) -> None:
         """Take a UAV's next record, and all that follows from it; raises RefusedError, and changes nothing."""
-        flight.accept(record)
+        episode.accept(record)
         self.roster[record.uav].sequence += 1
         self.out.entries.append(entries.flight_record(record))
-        self._exchange(flight)
+        self._exchange(episode)
 
-    def settle(self) -> None:
+    def finalise(self) -> None:
         """Journal what became final, end the episode when it is over, and let the learner have what it is owed."""
-        if self.flight is not None:
-            self._journal_truth(self.flight, self.flight.settle())
-            if self.flight.over:
-                self._end_episode(self.flight)
+        if self.episode is not None:
+            self._journal_truth(self.episode, self.episode.finalise())
+            if self.episode.over:
+                self._end_episode(self.episode)
         self._serve()
 
     @property
-    def settle_now(self) -> bool:
+    def finalise_now(self) -> bool:
         """True when the team may wait for `settle`: for the limiter, or, when the last exchange was, for an episode."""
-        return self.learning or self.flight is None or self.flight.next_exchange > self.flight.T
+        return self.learning or self.episode is None or self.episode.next_exchange > self.episode.T
 
-    def _exchange(self, flight: Flight) -> None:
+    def _exchange(self, episode: EpisodeState) -> None:
         """Answer the exchanges that can be held."""
-        for exchange in flight.exchanges():
-            self._answer(flight, exchange)
+        for exchange in episode.exchanges():
+            self._answer(episode, exchange)
         if not self.learning:
             self._release()
 
-    def _answer(self, flight: Flight, exchange: Exchange) -> None:
+    def _answer(self, episode: EpisodeState, exchange: Exchange) -> None:
         self.version = exchange.version
-        self.out.entries += entries.exchange(flight, exchange, self.policies.newest)
+        self.out.entries += entries.exchange(episode, exchange, self.policies.newest)
         for i in exchange.uavs:
             member = self.roster[i]
             member.policy = self.policies.newest
-            answer = flight.answer(exchange, member.policy, member.sequence - 1, member.durable)
+            answer = episode.answer(exchange, member.policy, member.sequence - 1, member.durable)
             self._held.append((uav_name(i), answer))
 
-    def _journal_truth(self, flight: Flight, truth: Truth) -> None:
+    def _journal_truth(self, episode: EpisodeState, truth: FinalTicks) -> None:
         if not truth.uncertainty:
             return
         moves = len(truth.uncertainty) - (truth.first == 0)
         self.ticks += moves
         self.steps += sum(truth.present[-moves:]) if moves else 0
-        self.limiter.insert(moves, len(self.replay))
+        self.rate_limiter.insert(moves, len(self.replay))
         self.uncertainty = truth.uncertainty[-1]
-        updates = self.limiter.updates
-        self.out.entries += entries.truth(flight, truth, self.steps, updates, self.policies.newest)
+        updates = self.rate_limiter.updates
+        self.out.entries += entries.truth(episode, truth, self.steps, updates, self.policies.newest)
 
     # Episodes.
 
@@ -211,48 +213,48 @@ class Station:
         """The next episode, which those who are `away` have no part in; nothing when everybody is."""
         if len(away) == len(self.roster):
             return  # gather again
-        self.flight = flight = Flight(self.world, self.reward, self.replay, self.episodes + 1, self.version)
-        self._journal_episode(flight, "begin")
+        self.episode = episode = EpisodeState(self.world, self.reward, self.replay, self.episodes + 1, self.version)
+        self._journal_episode(episode, "begin")
         for i in away:
-            self.lose(flight, i)
+            self.lose(episode, i)
         for i, member in enumerate(self.roster):
             member.answer, member.policy = None, self.policies.newest
             if i not in away:
-                self._held.append((uav_name(i), flight.begin(i, self.policies.newest, self.roster[i].sequence)))
+                self._held.append((uav_name(i), episode.begin(i, self.policies.newest, self.roster[i].sequence)))
         self._release()
 
     def _resume(self, i: int) -> None:
-        flight, member = self.flight, self.roster[i]
-        if flight is None or self._held:
+        episode, member = self.episode, self.roster[i]
+        if episode is None or self._held:
             return  # the limiter holds the team back: it is told when the others are, or says hello again
-        relay.tracks(self, i, flight.lost)
-        self.send(uav_name(i), flight.begin(i, member.policy, member.sequence))
-        if member.answer is not None and member.answer.tick == flight.reported[i]:
+        relay.tracks(self, i, episode.lost)
+        self.send(uav_name(i), episode.begin(i, member.policy, member.sequence))
+        if member.answer is not None and member.answer.tick == episode.reported[i]:
             self.send(uav_name(i), member.answer)
 
-    def _end_episode(self, flight: Flight) -> None:
-        self.episodes = flight.episode
-        self.blocked += sum(flight.blocked.values())
-        self.blocked_by_uav += flight.blocked[Block.UAV]
-        self.episode_uncertainty = flight.total_uncertainty / flight.T
-        self._journal_episode(flight, "end")
-        self.out.entries.append(entries.state(flight, self.replay))
-        self.flight = None
+    def _end_episode(self, episode: EpisodeState) -> None:
+        self.episodes = episode.number
+        self.blocked += sum(episode.blocked.values())
+        self.blocked_by_uav += episode.blocked[Block.UAV]
+        self.episode_uncertainty = episode.total_uncertainty / episode.T
+        self._journal_episode(episode, "end")
+        self.out.entries.append(entries.state(episode, self.replay))
+        self.episode = None
         if self.episodes < self.config.training.episodes and not self.playing:
             self.begin_episode(roster.away(self.roster))
         else:
             self._finish_if_done()
 
-    def _journal_episode(self, flight: Flight, phase: str) -> None:
-        epsilon = self.config.epsilon(flight.episode)
-        self.out.entries.append(entries.episode(flight, phase, epsilon, self.steps, self.limiter.updates))
+    def _journal_episode(self, episode: EpisodeState, phase: str) -> None:
+        epsilon = self.config.epsilon(episode.number)
+        self.out.entries.append(entries.episode(episode, phase, epsilon, self.steps, self.rate_limiter.updates))
 
     def _finish_if_done(self) -> None:
         """Send everybody home once the last episode is over and journalled, and the learner has caught up."""
         if self.phase != "done" or any(member.durable < member.sequence for member in self.roster):
             return
-        if self.learning and not self.feed.told_the_end:
-            self.feed.told_the_end = True
+        if self.learning and not self.sample_queue.told_the_end:
+            self.sample_queue.told_the_end = True
             self.send(LEARNER, m.End(GOODBYE))
         if not self._ended:
             self._ended = True
@@ -268,7 +270,9 @@ class Station:
     # Answers held back by the limiter.
 
     def _release(self) -> None:
-        if self.limiter.may_insert or self.flight is None or not len(self.replay):  # nothing to learn from: fly on
+        if (
+            self.rate_limiter.can_insert or self.episode is None or not len(self.replay)
+        ):  # nothing to learn from: fly on
             for to, message in self._held:
                 if isinstance(message, m.Map):
                     self.roster[int(to[4:])].answer = message
@@ -282,7 +286,7 @@ class Station:
     # The learner.
 
     def _sample_request(self, sender: str, request: m.SampleRequest, _now: float) -> None:
-        problem = self.feed.ask(request)
+        problem = self.sample_queue.ask(request)
         if problem is None:
             self._serve()
         else:
@@ -290,7 +294,7 @@ class Station:
 
     def _serve(self) -> None:
         """Answer minibatch requests as far as the limiter allows."""
-        for minibatch in self.feed.serve(self.episodes, self.ticks):
+        for minibatch in self.sample_queue.serve(self.episodes, self.ticks):
             self.send(LEARNER, minibatch)
         self._release()
         self._finish_if_done()
@@ -313,30 +317,30 @@ class Station:
 
     def tick(self, now: float) -> None:
         """Name, once each, the UAVs that have been silent for some time, and go on without those silent for long."""
-        flight, patience = self.flight, self.config.comms.patience
-        if flight is None:
+        episode, patience = self.episode, self.config.comms.silence_warning
+        if episode is None:
             return
         for i in roster.silent(self.roster, now, patience):
-            text = f"has been silent for {patience:g} s at tick {flight.next_exchange}; others wait"
+            text = f"has been silent for {patience:g} s at tick {episode.next_exchange}; others wait"
             self.out.notes.append(("WARNING", f"{uav_name(i)} {text}"))
         for i in roster.long_silent(self.roster, now, self.config.comms.lost_after):
-            if i in flight.lost:  # it was back, for the next episode
-                self.roster[i].life = -1
-            elif self.flight is flight:  # else the first of them ended the episode
-                self.lose(flight, i)
-                self.early.accept(self, flight)
-                self.settle()
+            if i in episode.lost:  # it was back, for the next episode
+                self.roster[i].incarnation = -1
+            elif self.episode is episode:  # else the first of them ended the episode
+                self.lose(episode, i)
+                self.reorder_buffer.accept(self, episode)
+                self.finalise()
 
-    def lose(self, flight: Flight, i: int) -> None:
+    def lose(self, episode: EpisodeState, i: int) -> None:
         """Go on without a UAV for the rest of the episode."""
-        self.roster[i].life = -1  # whoever comes back says hello first
-        self.early.drop(i)
-        last = flight.lose(i)
-        self.out.entries.append(entries.lost(flight, i))
-        text = f"{uav_name(i)} is lost after tick {last} of episode {flight.episode}; the others go on without it"
+        self.roster[i].incarnation = -1  # whoever comes back says hello first
+        self.reorder_buffer.drop(i)
+        last = episode.lose(i)
+        self.out.entries.append(entries.lost(episode, i))
+        text = f"{uav_name(i)} is lost after tick {last} of episode {episode.number}; the others go on without it"
         self.out.notes.append(("ERROR", text))
-        relay.loss(self, i, range(flight.N))
-        self._exchange(flight)
+        relay.loss(self, i, range(episode.N))
+        self._exchange(episode)
 
 
 _HANDLERS: dict[type[m.Message], Callable[[Station, str, Any, float], None]] = {

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 def status(station: Station) -> Status:
     """How far the mission is."""
-    flight = station.flight
+    episode = station.episode
     return Status(
-        station.phase, flight.episode if flight else station.episodes, max(flight.done, 0) if flight else 0,
-        station.ticks, station.limiter.updates, station.policies.newest, station.loss, station.uncertainty,
+        station.phase, episode.number if episode else station.episodes, max(episode.done, 0) if episode else 0,
+        station.ticks, station.rate_limiter.updates, station.policies.newest, station.loss, station.uncertainty,
         station.episode_uncertainty, station.blocked, station.rejected, roster.name_some(station.waiting_for()),
     )  # fmt: skip

@@ -52,7 +52,7 @@ class World:
 @dataclass(frozen=True)
 class Team:
     size: int = _s(3, "N, the number of UAVs", "UAVs", "Sec. IV-C")
-    pilot: str = _s("policy", "who flies: policy, or planner:random, planner:random-road, planner:greedy")
+    controller: str = _s("policy", "who flies: policy, or planner:random, planner:random-road, planner:greedy")
     sensing_range: float = _s(1.5, "r_s in scenario II", "cell widths d", "Sec. IV-B")
 
 
@@ -62,7 +62,7 @@ class Comms:
     phase: Literal["together", "staggered"] = _s(
         "together", "all UAVs exchange at t mod T_u = 0, or UAV i at floor(i T_u / N)", source="Algorithm 1; Sec. II-C"
     )
-    patience: float = _s(30.0, "silence after which the TMC names a UAV that others wait for", "s")
+    silence_warning: float = _s(30.0, "silence after which the TMC names a UAV that others wait for", "s")
     lost_after: float = _s(60.0, "silence after which it declares it lost, and the others go on without it", "s")
 
 
@@ -110,7 +110,7 @@ class Network:
 @dataclass(frozen=True)
 class DQN:
     learning_rate: float = _s(1e-3, "Adam's step size", source="Table I")
-    batch: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I")
+    batch_size: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I")
     gamma: float = _s(0.99, "discount factor", "1/tick", "Table I")
     n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (8): 1")
     double: bool = _s(False, "choose a' by the online network (double Q-learning)", source="eq. (8): no")
@@ -125,13 +125,13 @@ class Replay:
     capacity: int = _s(100_000, "transitions that the replay memory holds", "transitions", "Table I")
     learn_start: int = _s(128, "transitions before the first minibatch", "transitions", "left open: b")
     updates_per_tick: float = _s(1.0, "minibatches a tick of the team", "updates/tick", "Algorithm 1: one")
-    priority: float = _s(
+    priority_exponent: float = _s(
         0.0, "alpha: a transition is drawn in proportion to |TD error|^alpha; 0: all alike", source="eq. (8): all alike"
     )
-    correction: float = _s(
+    importance_exponent: float = _s(
         0.4, "beta: weights in the loss that make up for it, in full at 1", source="Schaul et al. 2016, Sec. 3.4"
     )
-    slack: int = _s(200, "how far ticks and updates may drift apart before the limiter holds one back", "ticks")
+    error_buffer: int = _s(200, "how far ticks and updates may drift apart before the limiter holds one back", "ticks")
 
 
 @dataclass(frozen=True)
@@ -139,15 +139,17 @@ class Training:
     episodes: int = _s(500, "E, episodes", "episodes", "Table I")
     ticks: int = _s(1000, "T_ep, ticks in an episode", "ticks of 60 s", "Table I")
     seed: int = _s(1, "key of every random draw")
-    push_every: int = _s(100, "updates between two policies pushed to the TMC", "updates", "left open")
+    publish_every: int = _s(100, "updates between two policies pushed to the TMC", "updates", "left open")
     checkpoint_every: int = _s(5000, "updates between two checkpoints", "updates")
     threads: int = _s(1, "threads of the learner's arithmetic", "threads")
 
 
 @dataclass(frozen=True)
 class Journal:
-    flush: float = _s(0.5, "longest time that a logged message stays in the process", "s")
-    commit: float = _s(0.05, "longest time that an accepted flight record waits for the TMC's group commit", "s")
+    flush_interval: float = _s(0.5, "longest time that a logged message stays in the process", "s")
+    commit_interval: float = _s(
+        0.05, "longest time that an accepted flight record waits for the TMC's group commit", "s"
+    )
     durability: Literal["process", "power"] = _s(
         "process", "what a committed record survives: kill -9 of the TMC, or a power cut as well (fsync)"
     )
@@ -162,8 +164,8 @@ class Trial:
     stall_share: float = _s(1.0, "probability that it stalls at a tick", "1/tick")
     stall_spread: float = _s(0.0, "stalls last from (1 - spread) to (1 + spread) times as long, at random")
     stall_uav: int = _s(-1, "the one UAV that stalls; -1: all of them")
-    witness: bool = _s(False, "UAVs log a hash of each observation that they decide on")
-    oath: bool = _s(False, "UAVs write down apart which of their records were acknowledged")
+    observation_hash: bool = _s(False, "UAVs log a hash of each observation that they decide on")
+    ack_log: bool = _s(False, "UAVs write down apart which of their records were acknowledged")
     ack_early: bool = _s(
         False, "the TMC acknowledges before it has journalled: records get lost, as the trial must see"
     )

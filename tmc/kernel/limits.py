@@ -22,7 +22,7 @@ RANGES: tuple[tuple[str, float, float], ...] = (
     ("team.size", 1, 1000),
     ("team.sensing_range", 0.0, 1000.0),
     ("comms.period", 1, 60_000),
-    ("comms.patience", 0.1, 1e6),
+    ("comms.silence_warning", 0.1, 1e6),
     ("comms.lost_after", 1.0, 1e6),
     ("reward.collision", -1e6, 1e6),
     ("reward.new_cell", -1e6, 1e6),
@@ -36,7 +36,7 @@ RANGES: tuple[tuple[str, float, float], ...] = (
     ("network.stride", 1, 64),
     ("network.dense", 1, 65_536),
     ("dqn.learning_rate", 1e-12, 10.0),
-    ("dqn.batch", 1, 65_536),
+    ("dqn.batch_size", 1, 65_536),
     ("dqn.gamma", 0.0, 1.0),
     ("dqn.n_step", 1, 1000),
     ("dqn.reward_scale", 1e-9, 1e9),
@@ -45,17 +45,17 @@ RANGES: tuple[tuple[str, float, float], ...] = (
     ("replay.capacity", 1, 1_000_000_000),
     ("replay.learn_start", 1, 1_000_000_000),
     ("replay.updates_per_tick", 0.0, 1000.0),
-    ("replay.priority", 0.0, 1.0),
-    ("replay.correction", 0.0, 1.0),
-    ("replay.slack", 1, 1_000_000),
+    ("replay.priority_exponent", 0.0, 1.0),
+    ("replay.importance_exponent", 0.0, 1.0),
+    ("replay.error_buffer", 1, 1_000_000),
     ("training.episodes", 1, 10_000_000),
     ("training.ticks", 1, 60_000),
     ("training.seed", 0, 2**63 - 1),
-    ("training.push_every", 1, 1_000_000_000),
+    ("training.publish_every", 1, 1_000_000_000),
     ("training.checkpoint_every", 1, 1_000_000_000),
     ("training.threads", 1, 1024),
-    ("journal.flush", 0.01, 60.0),
-    ("journal.commit", 0.0, 60.0),
+    ("journal.flush_interval", 0.01, 60.0),
+    ("journal.commit_interval", 0.0, 60.0),
     ("journal.chunk", 1024, 64 * 1024 * 1024),
     ("trial.stall", 0.0, 60.0),
     ("trial.stall_share", 0.0, 1.0),
@@ -129,10 +129,10 @@ def idle(config: Config) -> str | None:
 
 def remarks(config: Config) -> Iterator[str]:
     """What a training with these settings will not do, though something is learned; a sentence each."""
-    made, every, target = updates(config), config.training.push_every, config.dqn.target_updates
+    made, every, target = updates(config), config.training.publish_every, config.dqn.target_updates
     if every > made:
         yield (
-            f"the training makes {made:,} updates and training.push_every = {every:,}: "
+            f"the training makes {made:,} updates and training.publish_every = {every:,}: "
             "UAVs fly the initial policy to the end, and what is learned is in policies/final.onnx alone"
         )
     if target > made and not 0 < config.dqn.target_episodes <= config.training.episodes:

@@ -38,7 +38,7 @@ class Views:
         return Views(self.cells[which], self.peers[which], self.u[which])
 
 
-class Observer:
+class ObservationBuilder:
     """Builds observations of one world; holds tables, no state."""
 
     def __init__(self, world: World) -> None:
@@ -164,12 +164,13 @@ class Observer:
 
 
 class Canvas:
-    """One image that is drawn over in place, the same bits as `Observer.observe`: what stays is not drawn again.
+    """One image that is drawn over in place, the same bits as `ObservationBuilder.observe`: what stays is not drawn
+    again.
 
     `monitored`: the cells of U in a view of the whole grid; None where the view moves with the UAV.
     """
 
-    def __init__(self, observer: Observer, monitored: Ints | None) -> None:
+    def __init__(self, observer: ObservationBuilder, monitored: Ints | None) -> None:
         self.image = np.zeros((1, *observer.shape), np.float32)
         """Shape (1, C, H, W), always the same memory."""
         self._observer, self._monitored = observer, monitored
@@ -177,7 +178,7 @@ class Canvas:
         self._marked: list[int] | None = None
 
     def draw(self, cell: int, peers: list[int], u: NDArray[np.float64]) -> None:
-        """Make it o_i(t); arguments as for `Observer.observe`."""
+        """Make it o_i(t); arguments as for `ObservationBuilder.observe`."""
         if self._monitored is None or self._marked is None:
             self._observer.observe(cell, peers, u, self.image[0])
         else:

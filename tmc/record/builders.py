@@ -26,7 +26,7 @@ NUMERIC = {"|u1": "UINT8", "<u4": "UINT32", "<f4": "FLOAT32"}
 """Types of the fields of a Grid, by NumPy's name."""
 _KINDS = {name: kind for kind, name in NUMERIC.items()}
 
-_NUMBERS = ("uav", "life", "sequence", "episode", "first", "tick", "version", "policy")
+_NUMBERS = ("uav", "incarnation", "sequence", "episode", "first", "tick", "version", "policy")
 _ARRAYS = {
     "cells": "<u2", "actions": "u1", "blocks": "u1", "rewards": "<f4", "seen_tick": "<u2", "seen_cell": "<u2",
     "values": "<f4",
@@ -41,8 +41,8 @@ def flight_record(record: Record) -> Any:
 
 
 def record_digest(record: Record) -> str:
-    """BLAKE2b, hex, of all that a flight record says of the flight, whichever life of the UAV shipped it."""
-    numbers = " ".join(str(getattr(record, name)) for name in _NUMBERS if name != "life")
+    """BLAKE2b, hex, of all that a flight record says of the flight, whichever incarnation of the UAV shipped it."""
+    numbers = " ".join(str(getattr(record, name)) for name in _NUMBERS if name != "incarnation")
     arrays = (getattr(record, name).tobytes() for name in _ARRAYS)
     return hashlib.blake2b(b"".join((numbers.encode(), *arrays)), digest_size=16).hexdigest()
 
@@ -54,7 +54,9 @@ def to_record(proto: Any) -> Record:
         values |= {name: _array(getattr(proto, name), kind) for name, kind in _ARRAYS.items()}
         return Record(**values)
     except FieldError as error:
-        raise RecordError(f"a flight record of UAV {proto.uav} is not sound, so do not use this log: {error}") from None
+        raise RecordError(
+            f"a flight record of UAV {proto.uav} is not intact, so do not use this log: {error}"
+        ) from None
 
 
 def _array(values: Any, kind: str) -> NDArray[Any]:

@@ -46,7 +46,12 @@ CHANNELS: tuple[Channel, ...] = (
         "/learner/metrics", "overfly.LearnerMetrics", "learner", "loss, Q values and pace of learning, now and then"
     ),
     Channel("/uav/<id>/status", "overfly.UavStatus", "uav", "where the UAV is, how fast it flies, how long it waited"),
-    Channel("/uav/<id>/witness", "overfly.Witness", "uav", "in trials: a hash of each observation decided on"),
+    Channel(
+        "/uav/<id>/observation_hash",
+        "overfly.ObservationHashes",
+        "uav",
+        "in trials: a hash of each observation decided on",
+    ),
     Channel("/uav/<id>/fix", "foxglove.LocationFix", "uav", "position in degrees, sampled"),
     Channel("/log", "foxglove.Log", EVERY, "what the process says"),
 )

@@ -1,6 +1,7 @@
 """Two logs of one mission, fact by fact: the first that is not the same in both, with its tick and its UAV.
 
-What depends on the schedule is no fact: wall times, the lives of processes, and how many ticks one message holds.
+What depends on the schedule is no fact: wall times, the incarnations of processes, and how many ticks one message
+holds.
 """
 
 from __future__ import annotations
@@ -142,7 +143,7 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, int | float | str) else tuple(value)
 
 
-def _witness(w: Any) -> Keyed:
+def _hasher(w: Any) -> Keyed:
     first = max(w.first, 1) - 1
     yield from (((w.episode, t, _RANK["observation"], w.uav), seen) for t, seen in enumerate(w.hashes[:], first))
 
@@ -153,5 +154,5 @@ _READERS: dict[str, Callable[[Any], Keyed]] = {
     "overfly.TeamMetrics": _metrics,
     "overfly.Events": _events,
     "overfly.Episode": _episode,
-    "overfly.Witness": _witness,
+    "overfly.ObservationHashes": _hasher,
 }

@@ -27,7 +27,7 @@ def open_log(path: Path) -> IO[bytes]:
 
 
 def left_behind(path: Path, resume: bool) -> Path | None:
-    """The file that an earlier life left at `path`, to resume; RecordError rather than write over it."""
+    """The file that an earlier incarnation left at `path`, to resume; RecordError rather than write over it."""
     if path.suffix != ".mcap":
         raise RecordError(f"{path} must end in .mcap: correct the name of the log")
     there = [old for old in (path.with_name(path.name + ACTIVE), path) if old.exists()]

@@ -51,14 +51,14 @@ class _Source:
     ordered: bool = True
 
     def by_time(self) -> Iterable[Raw]:
-        """Its sound messages by log time; those of one time in the order of the file."""
+        """Its intact messages by log time; those of one time in the order of the file."""
         return self.log.raw() if self.ordered else sorted(self.log.raw(), key=_TIME)
 
 
 def merge(
     files: Mapping[str, Path], out: Path, prefix: str = "", show: Callable[[int, int], None] = lambda _done, _all: None
 ) -> Merged:
-    """Write all sound messages of `files` ({process: log}) to `out`, by log time, then in the order of the files.
+    """Write all intact messages of `files` ({process: log}) to `out`, by log time, then in the order of the files.
 
     `prefix` goes before every topic: `A` makes `/A/tmc/sync`. `show` gets the messages written, and all of them.
     What is damaged is merged up to the damage. Raises RecordError when nothing can be read or `out` not be written.

@@ -1,4 +1,4 @@
-"""Reads logs back: finished, still written, or cut off by a crash. What is given out is sound; nothing is guessed."""
+"""Reads logs back: finished, still written, or cut off by a crash. What is given out is intact; nothing is guessed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LOG_NAME = re.compile(rf"(tmc|learner|uav-\d+)\.mcap({re.escape(ACTIVE)})?")
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class LogMessage:
     """A message of a log. `log_time`, `publish_time`: ns; `sequence`: a counter a topic; `message`: protobuf."""
 
     topic: str
@@ -47,15 +47,15 @@ class Log:
         self._finished = False
 
     def raw(self, topics: Collection[str] | None = None) -> Iterator[Raw]:
-        """All sound messages in file order, of these topics only when given, not decoded."""
+        """All intact messages in file order, of these topics only when given, not decoded."""
         for item in self._items():
             if isinstance(item, list):
                 yield from (raw for raw in item if topics is None or raw.topic in topics)
 
-    def entries(self, topics: Collection[str] | None = None) -> Iterator[Entry]:
-        """All sound messages in file order, of these topics only when given."""
+    def entries(self, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
+        """All intact messages in file order, of these topics only when given."""
         for raw in self.raw(topics):
-            yield Entry(raw.topic, raw.log_time, raw.publish_time, raw.sequence, decode(raw))
+            yield LogMessage(raw.topic, raw.log_time, raw.publish_time, raw.sequence, decode(raw))
 
     @property
     def damage(self) -> str | None:
@@ -78,17 +78,17 @@ class Log:
 
     @property
     def still_open(self) -> bool:
-        """True for a file that still grows, or that a kill cut off, and is sound so far."""
+        """True for a file that still grows, or that a kill cut off, and is intact so far."""
         return self.path.name.endswith(ACTIVE) and self.cut
 
     @property
     def finished(self) -> bool:
-        """True when the file was closed in order and is sound to its end."""
+        """True when the file was closed in order and is intact to its end."""
         self._know()
         return self._finished
 
     def metadata(self) -> dict[str, str]:
-        """All facts in the file; where lives of a process differ, the last one's."""
+        """All facts in the file; where incarnations of a process differ, the last one's."""
         found: dict[str, str] = {}
         for item in self._items():
             if isinstance(item, Metadata):
@@ -106,7 +106,7 @@ class Log:
         return {key: "; ".join(facts[key] for facts in told) for key in (told[0] if told else {})}
 
     def extras(self) -> list[Metadata | Attachment]:
-        """What there is besides messages: metadata records, of each life of the process, and attachments."""
+        """What there is besides messages: metadata records, of each incarnation of the process, and attachments."""
         return [item for item in self._items() if isinstance(item, Metadata | Attachment)]
 
     def attachments(self) -> list[Attachment]:
@@ -160,8 +160,8 @@ def _class(schema: str, described: bytes) -> Any:
         return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema))
 
 
-def read(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Iterator[Entry]:
-    """All sound messages of a log in file order; `Log` also tells of damage."""
+def read(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Iterator[LogMessage]:
+    """All intact messages of a log in file order; `Log` also tells of damage."""
     return Log(path).entries(topics)
 
 

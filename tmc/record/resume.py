@@ -1,4 +1,4 @@
-"""Goes on with the log of an earlier life: copies what is sound in it to the file of the new one."""
+"""Goes on with the log of an earlier incarnation: copies what is intact in it to the file of the new one."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 def copy(old: Path, new: LogWriter) -> None:
-    """Copy all sound messages and attachments of `old`, numbers and times kept.
+    """Copy all intact messages and attachments of `old`, numbers and times kept.
 
     Metadata too. The torn end that a kill leaves is dropped. Where anything else is wrong, the old file is kept as
-    `*.damaged-1`, since there may be sound chunks behind the damage, and the new one says so.
+    `*.damaged-1`, since there may be intact chunks behind the damage, and the new one says so.
     """
     if old.stat().st_size == 0:
         return
@@ -34,4 +34,6 @@ def copy(old: Path, new: LogWriter) -> None:
     for raw in log.raw():
         new.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
     if log.damage is not None and not log.still_open:
-        new.log("error", f"{log.damage}: this life goes on from before that; the file is kept as {keep(old).name}")
+        new.log(
+            "error", f"{log.damage}: this incarnation goes on from before that; the file is kept as {keep(old).name}"
+        )

@@ -18,7 +18,7 @@ PACKAGE = "overfly"
 
 # Each field as "type name"; "*" marks a repeated one. See overfly.proto for what the fields mean.
 TYPES: dict[str, str] = {
-    "FlightRecord": "uint32 uav, uint64 life, uint64 sequence, uint32 episode, uint32 first, uint32 tick, "
+    "FlightRecord": "uint32 uav, uint64 incarnation, uint64 sequence, uint32 episode, uint32 first, uint32 tick, "
     "uint64 version, uint64 policy, uint32* cells, uint32* actions, uint32* blocks, float* rewards, "
     "uint32* seen_tick, uint32* seen_cell, float* values",
     "Sync": "uint32 episode, uint32 tick, uint64 version, uint64 policy, uint32* uavs, double believed",
@@ -35,7 +35,7 @@ TYPES: dict[str, str] = {
     "double td_abs, double grad_norm, double updates_per_second, double idle_share, double wall",
     "UavStatus": "uint32 uav, uint32 episode, uint32 tick, uint32 cell, double waited, double steps_per_second, "
     "uint32 explored, sint32 lead, uint32 lead_most, uint32 lead_tick, string lead_bound",
-    "Witness": "uint32 uav, uint32 episode, uint32 first, uint32 tick, fixed64* hashes",
+    "ObservationHashes": "uint32 uav, uint32 episode, uint32 first, uint32 tick, fixed64* hashes",
     "TeamTick": "uint32 episode, uint32 tick, double uncertainty, double uncertainty_per_cell, double believed, "
     "double believed_per_cell, double reward, uint32 blocked, uint32 answered, uint32 uavs",
     "UavTick": "uint32 uav, uint32 episode, uint32 tick, uint32 cell, uint32 action, uint32 block, double reward, "
@@ -88,7 +88,7 @@ TeamMetrics = _own("TeamMetrics")
 Policy = _own("Policy")
 LearnerMetrics = _own("LearnerMetrics")
 UavStatus = _own("UavStatus")
-Witness = _own("Witness")
+ObservationHashes = _own("ObservationHashes")
 TeamTick = _own("TeamTick")
 UavTick = _own("UavTick")
 

@@ -37,9 +37,9 @@ class LogWriter:
     """The log of one process.
 
     `path` is the finished file's, `process` a name such as `tmc` or `uav-003`, `metadata` facts for the readers.
-    `resume`: go on with what an earlier life of the process left behind, finished or not, instead of refusing to.
-    `clock` gives the wall clock in ns, `timer` a clock in s that never goes back.
-    Raises RecordError for a file that cannot be written or is there already; after one, nothing more is written.
+    `resume`: go on with what an earlier incarnation of the process left behind, finished or not, instead of refusing
+    to. `clock` gives the wall clock in ns, `timer` a clock in s that never goes back. Raises RecordError for a file
+    that cannot be written or is there already; after one, nothing more is written.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class LogWriter:
 
     def maybe_flush(self) -> None:
         """Flush when the configured time has passed since the last flush: call it in every idle round."""
-        if self._timer() - self._flushed >= self._journal.flush:
+        if self._timer() - self._flushed >= self._journal.flush_interval:
             self.flush()
 
     def close(self) -> None:

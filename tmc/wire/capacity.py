@@ -65,14 +65,14 @@ def needs(world: World, *, learning: bool) -> Iterator[Need]:
 
 def _of_learning(world: World) -> Iterator[Need]:
     """The fields that only a learner and its TMC fill."""
-    config, batch, network = world.config, world.config.dqn.batch, world.config.network
+    config, batch, network = world.config, world.config.dqn.batch_size, world.config.network
     size = policy_bytes(config, view_shape(config, world.grid))
     cause = f"a policy with network.dense = {network.dense} and network.channels = {list(network.channels)[:8]}"
     yield Need(m.PolicyPush, "model", size, "bytes", cause, "lower these, or raise network.stride")
-    yield Need(m.SampleRequest, "index", batch, "transitions", "dqn.batch", "lower it")
+    yield Need(m.SampleRequest, "index", batch, "transitions", "dqn.batch_size", "lower it")
     for name, width in (("u", world.law.cells.size), ("peers", max(config.team.size - 1, 1))):
         most = int(fields.rules(m.Minibatch)[name].high) // (2 * width)
-        cause = f"a minibatch of dqn.batch = {batch}"
+        cause = f"a minibatch of dqn.batch_size = {batch}"
         yield Need(m.Minibatch, name, 2 * batch * width, "values", cause, f"choose {most} or less")
 
 

@@ -68,8 +68,8 @@ def parse(text: str) -> Endpoint:
     return Endpoint(found["ipv6"] or found["host"], port, ipv6=bool(found["ipv6"]))
 
 
-def feed_endpoint(sync: str) -> str:
-    """The learner's endpoint, beside that of the UAVs: the next tcp port, or the same ipc path with `.feed`."""
+def learner_endpoint(sync: str) -> str:
+    """The learner's endpoint, beside that of the UAVs: the next tcp port, or the same ipc path with `.sample_queue`."""
     endpoint = parse(sync)
     if endpoint.path:
         return str(replace(endpoint, path=endpoint.path + FEED))

@@ -12,7 +12,7 @@ import numpy as np
 
 FRAME_LIMIT = 64 * 1024 * 1024
 """Largest frame, bytes: what a socket takes (tmc.wire.sockets)."""
-FEW = 64
+SMALL_ARRAY_ENTRIES = 64
 
 
 class FieldError(ValueError):
@@ -142,7 +142,11 @@ def _array(value: Any, rule: Rule) -> str:
 
 def _all_finite(value: Any) -> bool:
     """A flight record has some ten entries, for which NumPy's calls cost more than plain Python."""
-    return all(map(math.isfinite, value.ravel().tolist())) if value.size <= FEW else bool(np.isfinite(value).all())
+    return (
+        all(map(math.isfinite, value.ravel().tolist()))
+        if value.size <= SMALL_ARRAY_ENTRIES
+        else bool(np.isfinite(value).all())
+    )
 
 
 _CHECKS = {"int": _int, "float": _float, "str": _str, "bytes": _bytes, "array": _array, "tensor": _array}

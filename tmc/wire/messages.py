@@ -1,6 +1,6 @@
-"""Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is sound.
+"""Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is intact.
 
-`docs/protocol.md` is the text to this table. Who sends what: UAV -> TMC: Hello, Record, Alive, PolicyRequest,
+`docs/protocol.md` is the text to this table. PolicySpec sends what: UAV -> TMC: Hello, Record, Alive, PolicyRequest,
 Bye. TMC -> UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
 TMC -> learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status.
 UAV -> UAV, passed on by the TMC where the two share no memory: Beacon.
@@ -33,11 +33,11 @@ class Message:
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """First word of a client. `uav` is -1 unless the role is "uav"; `life` is new each time a process starts."""
+    """First word of a client. `uav` is -1 unless the role is "uav"; `incarnation` is new each time a process starts."""
 
     role: str = f.choice("uav", "learner")
     uav: int = f.integer(-1, 65_535)
-    life: int = f.integer(0, 2**63 - 1)
+    incarnation: int = f.integer(0, 2**63 - 1)
     updates: int = f.integer(0, 2**62, default=0)
 
 
@@ -83,13 +83,13 @@ class Record(Message):
     `cells` has one entry a tick. `actions`, `blocks` (why a move was blocked, 0: it was not) and `rewards` (as the UAV
     reckons them by its own map) have one entry a move, so one less than `cells` when the record starts at tick 0.
     `seen_tick`, `seen_cell`: peers sensed, one entry a sighting. `version`: the map that the UAV flew by. `values`:
-    where a policy flies and `replay.priority` is not 0, two entries a move, Q(o_t, a_t) and max_a Q(o_t, a) over the
-    actions that the UAV may choose; else empty. `sent`: the wall clock of the UAV when it made the record, ns since
-    1970, for the log; 0 where there is no clock.
+    where a policy flies and `replay.priority_exponent` is not 0, two entries a move, Q(o_t, a_t) and max_a Q(o_t, a)
+    over the actions that the UAV may choose; else empty. `sent`: the wall clock of the UAV when it made the record, ns
+    since 1970, for the log; 0 where there is no clock.
     """
 
     uav: int = f.integer(0, 65_535)
-    life: int = f.integer(0, 2**63 - 1)
+    incarnation: int = f.integer(0, 2**63 - 1)
     sequence: int = f.integer(0, 2**62)
     episode: int = f.integer(1, 2**31 - 1)
     first: int = f.integer(0, 65_535)
@@ -130,7 +130,7 @@ class Alive(Message):
     for none (-1)."""
 
     uav: int = f.integer(0, 65_535)
-    life: int = f.integer(0, 2**63 - 1)
+    incarnation: int = f.integer(0, 2**63 - 1)
     tick: int = f.integer(0, 65_535)
     peer: int = f.integer(-1, 65_535)
     sequence: int = f.integer(0, 2**62)
@@ -165,14 +165,14 @@ class SampleRequest(Message):
     """One minibatch, please. `request` comes back in the answer.
 
     `index`, `errors`: the transitions of a minibatch that was just learned from, by number, and |Q - y| of each, which
-    is their priority from now on; both empty before the first one and where `replay.priority` is 0. `life`: of the
-    learner's process, as in `Hello`; 0 where there is only one.
+    is their priority from now on; both empty before the first one and where `replay.priority_exponent` is 0.
+    `incarnation`: of the learner's process, as in `Hello`; 0 where there is only one.
     """
 
     request: int = f.integer(0, 2**62)
     index: Array = f.array("<i8", 65_536, empty=True)
     errors: Array = f.array("<f4", 65_536, empty=True)
-    life: int = f.integer(0, 2**63 - 1, default=0)
+    incarnation: int = f.integer(0, 2**63 - 1, default=0)
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Minibatch(Message):
     those of o_{t+n}. `reward`: the n-step sum, unscaled. `discount`: gamma^n. `allowed`: (b, 9), 0 for the actions that
     a UAV in o_{t+n} would not choose. `episodes`: finished by its tick. `index`: a number of each transition, which no
     other has before the TMC's next `Welcome`. `weight`: of each transition in the loss; empty where all count alike,
-    that is where `replay.priority` is 0.
+    that is where `replay.priority_exponent` is 0.
     """
 
     request: int = f.integer(0, 2**62)
@@ -204,7 +204,7 @@ class Minibatch(Message):
 class PolicyPush(Message):
     """The learner's policy after `updates` updates; a version that is not newer is refused.
 
-    `sent`: as in `Record`; `life`: as in `SampleRequest`.
+    `sent`: as in `Record`; `incarnation`: as in `SampleRequest`.
     """
 
     version: int = f.integer(1, 2**62)
@@ -212,7 +212,7 @@ class PolicyPush(Message):
     loss: float = f.real(-1e30, 1e30)
     model: bytes = f.blob(64 * 1024 * 1024)
     sent: int = f.integer(0, 2**63 - 1, default=0)
-    life: int = f.integer(0, 2**63 - 1, default=0)
+    incarnation: int = f.integer(0, 2**63 - 1, default=0)
 
 
 @dataclass(frozen=True)
@@ -281,12 +281,12 @@ class Bye(Message):
 class Error(Message):
     """What was wrong with your frame, and the mend. Nothing was changed by it.
 
-    `life`: of the process that sent the frame, where it told: another one may have its name by now.
+    `incarnation`: of the process that sent the frame, where it told: another one may have its name by now.
     """
 
     code: str = f.choice("malformed", "version", "unknown", "range", "state", "fenced", "refused")
     text: str = f.text(1024)
-    life: int = f.integer(0, 2**63 - 1, default=0)
+    incarnation: int = f.integer(0, 2**63 - 1, default=0)
 
 
 MESSAGES: tuple[type[Message], ...] = (

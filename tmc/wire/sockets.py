@@ -18,7 +18,7 @@ from typing import Any
 import zmq
 
 from tmc.wire.codec import CodecError, decode, encode
-from tmc.wire.endpoints import EndpointError, feed_endpoint, listens, parse, to_bind, to_connect
+from tmc.wire.endpoints import EndpointError, learner_endpoint, listens, parse, to_bind, to_connect
 from tmc.wire.fields import FRAME_LIMIT
 from tmc.wire.messages import Message
 
@@ -35,8 +35,18 @@ FIXES = {
 }
 """What to do where an endpoint cannot be bound, by the reason."""
 __all__ = [
-    "EndpointError", "check_free", "dealer", "feed_endpoint", "free_port", "receive", "receive_message", "router",
-    "send", "sender_name", "unlink", "waiting",
+    "EndpointError",
+    "check_free",
+    "dealer",
+    "free_port",
+    "learner_endpoint",
+    "receive",
+    "receive_message",
+    "router",
+    "send",
+    "sender_name",
+    "unlink",
+    "waiting",
 ]  # fmt: skip
 
 
@@ -55,7 +65,7 @@ def free_port() -> int:
 
 def check_free(endpoint: str) -> None:
     """Raise EndpointError unless both endpoints of a TMC can be bound here and now."""
-    ends = (endpoint, feed_endpoint(endpoint))
+    ends = (endpoint, learner_endpoint(endpoint))
     with zmq.Context() as context:
         for one in ends:
             router(context, one).close()

@@ -1,4 +1,4 @@
-"""Holds what UAVs have sworn was acknowledged against the journal: nothing is lost, and nothing is there twice."""
+"""Compares the acknowledgements that UAVs logged with the journal: no record is lost, and none is there twice."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Number = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Exactness:
+class DeliveryReport:
     """What became of the records of a mission, as counts, and what was flown by its journal.
 
-    `lost`: acknowledged, and not in the journal with the digest that was sworn; `doubled`: there more than once.
+    `lost`: acknowledged, and not in the journal with the same digest; `doubled`: there more than once.
     """
 
     acknowledged: int
@@ -34,8 +34,8 @@ class Exactness:
     updates: int
 
 
-def judge(out: Path, known: Collection[Number] = ()) -> Exactness:
-    """The whole journal of a run against all that was sworn in it; `known`: records that are known to be lost."""
+def check_delivery(out: Path, known: Collection[Number] = ()) -> DeliveryReport:
+    """Compare the journal of a run with all that was acknowledged in it; `known`: records that are known to be lost."""
     digests: dict[Number, str] = {}
     times: Counter[Number] = Counter()
     flown = Counter[str]()
@@ -50,12 +50,12 @@ def judge(out: Path, known: Collection[Number] = ()) -> Exactness:
             flown["updates"] = message.updates
         elif kind == "Episode":
             flown["episodes"] += message.phase == "end"
-    oaths = set(_oaths(out))
-    lost = {number for number, digest in oaths if digests.get(number) != digest} | {*known}
+    acks = set(_acks(out))
+    lost = {number for number, digest in acks if digests.get(number) != digest} | {*known}
     doubled = sum(count > 1 for count in times.values())
-    sworn = {number for number, _ in oaths}
-    return Exactness(
-        len(sworn), len(times), len(lost), doubled, flown["episodes"], flown["ticks"], flown["updates"]
+    acknowledged = {number for number, _ in acks}
+    return DeliveryReport(
+        len(acknowledged), len(times), len(lost), doubled, flown["episodes"], flown["ticks"], flown["updates"]
     )  # fmt: skip
 
 
@@ -65,14 +65,14 @@ def _journal(out: Path) -> Path:
     return found
 
 
-def oath_files(out: Path) -> list[Path]:
-    """Where UAVs have sworn."""
-    return sorted((out / "oaths").glob("uav-*.txt"))
+def ack_files(out: Path) -> list[Path]:
+    """Where UAVs have acknowledged."""
+    return sorted((out / "acks").glob("uav-*.txt"))
 
 
-def _oaths(out: Path) -> Iterable[tuple[Number, str]]:
+def _acks(out: Path) -> Iterable[tuple[Number, str]]:
     """((uav, sequence), digest) of each line."""
-    for path in oath_files(out):
+    for path in ack_files(out):
         uav = int(path.stem.removeprefix("uav-"))
         for line in path.read_text("utf-8").splitlines():
             sequence, digest = line.split()
@@ -81,25 +81,25 @@ def _oaths(out: Path) -> Iterable[tuple[Number, str]]:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The journal as a kill of the TMC left it, and the last record that each UAV had sworn to by then.
+    """The journal as a kill of the TMC left it, and the last record that each UAV had acknowledged to by then.
 
     A record that is lost with a kill may be flown again, the very same: only here it can be seen that it was lost.
     """
 
     journal: Path
-    sworn: dict[int, int]
+    acknowledged: dict[int, int]
 
     @classmethod
     def take(cls, out: Path) -> Snapshot:
         """Keep the journal under another name: the next TMC writes a new file."""
-        link = out / "oaths" / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
+        link = out / "acks" / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
         os.link(_journal(out), link)
-        sworn = {}
-        for path in oath_files(out):
+        acknowledged = {}
+        for path in ack_files(out):
             lines = path.read_text("utf-8").splitlines()
             if lines:
-                sworn[int(path.stem.removeprefix("uav-"))] = int(lines[-1].split()[0])
-        return cls(link, sworn)
+                acknowledged[int(path.stem.removeprefix("uav-"))] = int(lines[-1].split()[0])
+        return cls(link, acknowledged)
 
     def lost(self) -> set[Number]:
         """Records that were acknowledged and did not survive; the file is dropped."""
@@ -108,4 +108,4 @@ class Snapshot:
             if raw.schema == "overfly.FlightRecord":
                 counts[int(raw.topic.split("/")[2])] += 1  # a UAV's records are numbered from 0, without gap
         self.journal.unlink()
-        return {(uav, n) for uav, last in self.sworn.items() for n in range(counts[uav], last + 1)}
+        return {(uav, n) for uav, last in self.acknowledged.items() for n in range(counts[uav], last + 1)}

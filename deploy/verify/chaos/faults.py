@@ -8,9 +8,9 @@ from random import Random
 
 KILL, STOP, CUT, POWER = "kill", "stop", "cut", "power"
 """kill -9; SIGSTOP and SIGCONT; connections are dropped; all processes are killed at once and their files are cut."""
-PAUSE = (0.2, 1.0)
-"""Seconds of undisturbed flight before a blow, at least and at most."""
-MOMENT = (0.1, 1.0)
+PAUSE_S = (0.2, 1.0)
+"""Seconds of undisturbed flight before a fault, at least and at most."""
+FAULT_DURATION_S = (0.1, 1.0)
 """Seconds that a process is stopped, or that connections stay cut."""
 TWICE = 0.2
 """Share of kills that are followed by another one before its process is back."""
@@ -19,7 +19,7 @@ BESIDE = 0.35
 
 
 @dataclass(frozen=True)
-class Blow:
+class Fault:
     """One thing that is done: `pause` seconds after the last one was got over, to these processes by name.
 
     `seconds`: how long a stop or a cut lasts, or how long after the first process a second one is killed. `draw`: in
@@ -38,23 +38,23 @@ class Blow:
         return {KILL: len(self.targets), POWER: 1}.get(self.kind, 0)
 
 
-def blows(kills: int, seed: int, names: Sequence[str], *, power: bool) -> list[Blow]:
+def draw_faults(kills: int, seed: int, names: Sequence[str], *, power: bool) -> list[Fault]:
     """Blows with so many kills in all, to the TMC, the learner if there is one, and the UAVs, each as often.
 
     `power`: half of the kills are power cuts.
     """
-    draw, made, left = Random(seed), list[Blow](), kills
+    draw, made, left = Random(seed), list[Fault](), kills
     while left:
         if power and draw.random() < 0.5:
-            made.append(_blow(draw, POWER, ()))
+            made.append(_fault(draw, POWER, ()))
         else:
             count = 2 if left > 1 and draw.random() < TWICE else 1
-            made.append(_blow(draw, KILL, tuple(_target(draw, names) for _ in range(count))))
+            made.append(_fault(draw, KILL, tuple(_target(draw, names) for _ in range(count))))
         left -= made[-1].kills
         if draw.random() < BESIDE:
-            made.append(_blow(draw, STOP, (_target(draw, names),)))
+            made.append(_fault(draw, STOP, (_target(draw, names),)))
         if draw.random() < BESIDE:
-            made.append(_blow(draw, CUT, ()))
+            made.append(_fault(draw, CUT, ()))
     return made
 
 
@@ -63,8 +63,8 @@ def role(name: str) -> str:
     return name.partition("-")[0]
 
 
-def _blow(draw: Random, kind: str, targets: tuple[str, ...]) -> Blow:
-    return Blow(kind, targets, draw.uniform(*PAUSE), draw.uniform(*MOMENT), draw.random())
+def _fault(draw: Random, kind: str, targets: tuple[str, ...]) -> Fault:
+    return Fault(kind, targets, draw.uniform(*PAUSE_S), draw.uniform(*FAULT_DURATION_S), draw.random())
 
 
 def _target(draw: Random, names: Sequence[str]) -> str:

@@ -35,7 +35,7 @@ def synced(out: Path, journal: Path) -> int:
 
     Half of it where the TMC never waits for the disk: the system writes by itself now and then.
     """
-    now, told = journal.stat(), out / "oaths" / "tmc.txt"
+    now, told = journal.stat(), out / "acks" / "tmc.txt"
     if not told.exists():
         return now.st_size // 2
     inode, size = told.read_text("utf-8").split("\n")[-2].split()

@@ -13,7 +13,7 @@ from pathlib import Path
 from random import Random
 
 from deploy.run.plan import Plan
-from tmc.wire.sockets import feed_endpoint
+from tmc.wire.sockets import learner_endpoint
 
 SIZE = 65_536
 """Bytes that are passed on at once."""
@@ -88,13 +88,13 @@ class Forwarder:
             self._drop(pair)
 
 
-class Wire:
+class CuttableProxy:
     """Both endpoints of a plan, with a forwarder before each; `plan` has the clients connect to these."""
 
     def __init__(self, plan: Plan) -> None:
-        ends = [plan.endpoint, feed_endpoint(plan.endpoint)]
+        ends = [plan.endpoint, learner_endpoint(plan.endpoint)]
         near = f"{IPC}{plan.scratch}/near"
-        fronts = [near, feed_endpoint(near)]
+        fronts = [near, learner_endpoint(near)]
         self.forwarders = [Forwarder(_path(front), _path(end)) for front, end in zip(fronts, ends, strict=True)]
         children = tuple(replace(child, command=_redirected(child.command, near)) for child in plan.children)
         self.plan = replace(plan, children=children)

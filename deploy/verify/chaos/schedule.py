@@ -1,4 +1,4 @@
-"""The blows that are still to come, and what came of those before: it lasts for several missions, if need be."""
+"""The faults that are still to come, and what came of those before: it lasts for several missions, if need be."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from deploy.run.progress import clock
 from deploy.verify.chaos.checker import Number, Snapshot
-from deploy.verify.chaos.faults import POWER, Blow
+from deploy.verify.chaos.faults import POWER, Fault
 from tmc.wire import messages as m
 
 
@@ -30,18 +30,18 @@ class Growth:
         self.last = status or self.last
 
 
-class Storm:
+class FaultSchedule:
     """`say` shows the progress, `diary` is the file in which everything is noted with its time.
 
     `until_loss`: it is over as soon as a loss was seen.
     """
 
     def __init__(
-        self, blows: Iterable[Blow], say: Callable[[str], None], diary: Path, *, until_loss: bool = False
+        self, faults: Iterable[Fault], say: Callable[[str], None], diary: Path, *, until_loss: bool = False
     ) -> None:
-        self._left, self.say, self._diary, self._until_loss = deque(blows), say, diary, until_loss
-        self.asked = sum(blow.kills for blow in self._left)
-        self.done: list[Blow] = []
+        self._left, self.say, self._diary, self._until_loss = deque(faults), say, diary, until_loss
+        self.asked = sum(fault.kills for fault in self._left)
+        self.done: list[Fault] = []
         self.kills: Counter[str] = Counter()
         self.backs: Counter[str] = Counter()
         self.recoveries: defaultdict[str, list[float]] = defaultdict(list)
@@ -51,35 +51,35 @@ class Storm:
         self.lost: set[Number] = set()
         """Records of this mission that were acknowledged and did not survive a kill."""
         self.cut_off = 0
-        self.dark: float | None = None
+        self.power_lost: float | None = None
         """When the power went, until the mission goes on."""
         self.growth = Growth()
         self.went_on = False
         self._start = time.monotonic()
 
     @property
-    def next(self) -> Blow | None:
-        """The next blow, None when the storm is over."""
+    def next(self) -> Fault | None:
+        """The next fault, None when the schedule is over."""
         return self._left[0] if self._left else None
 
     @property
-    def last(self) -> Blow:
-        """The blow before."""
+    def last(self) -> Fault:
+        """The fault before."""
         return self.done[-1]
 
-    def struck(self) -> None:
-        """The next blow falls now."""
-        self.done.append(blow := self._left.popleft())
-        self.write(f"{blow.kind} {' '.join(blow.targets)} ({blow.seconds:.2f} s)")
+    def started(self) -> None:
+        """The next fault falls now."""
+        self.done.append(fault := self._left.popleft())
+        self.write(f"{fault.kind} {' '.join(fault.targets)} ({fault.seconds:.2f} s)")
 
-    def later(self, blow: Blow) -> None:
-        """What is left of a blow to which a mission's end came first, for the next mission."""
-        if blow.targets:
-            self._left.appendleft(blow)
+    def later(self, fault: Fault) -> None:
+        """What is left of a fault to which a mission's end came first, for the next mission."""
+        if fault.targets:
+            self._left.appendleft(fault)
 
     def count(self, kind: str) -> int:
         """Blows of a kind so far."""
-        return sum(blow.kind == kind for blow in self.done)
+        return sum(fault.kind == kind for fault in self.done)
 
     def back(self, who: str, seconds: float | None) -> None:
         """A process that was killed is back and works, so long after; None where that could not be measured."""
@@ -88,11 +88,11 @@ class Storm:
             self.recoveries[who].append(seconds)
             self.write(f"{who} is back after {seconds:.2f} s")
 
-    def lit(self, *, measured: bool) -> None:
+    def power_restored(self, *, measured: bool) -> None:
         """If the power was gone: the mission goes on, or has come to its end."""
-        if self.dark is not None:
-            self.back(POWER, time.monotonic() - self.dark if measured else None)
-            self.dark = None
+        if self.power_lost is not None:
+            self.back(POWER, time.monotonic() - self.power_lost if measured else None)
+            self.power_lost = None
 
     def check_snapshots(self) -> None:
         """Look for losses in the journals that kills have left."""
@@ -103,10 +103,10 @@ class Storm:
                 self._left = deque() if self._until_loss else self._left
                 self.write(f"{len(lost)} acknowledged records did not survive: {sorted(lost)[:10]}")
 
-    def calm(self, seconds: float) -> None:
-        """The storm is over, and the mission goes on."""
+    def finish(self, seconds: float) -> None:
+        """The schedule is over, and the mission goes on."""
         self.went_on = True
-        self.write(f"the mission goes on after the last blow, seen after {seconds:.2f} s")
+        self.write(f"the mission goes on after the last fault, seen after {seconds:.2f} s")
 
     def note(self, text: str) -> None:
         """What the supervisor says: a process that failed by itself is remembered."""

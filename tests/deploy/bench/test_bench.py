@@ -14,7 +14,7 @@ from deploy import cli
 from deploy.bench import cores, journal, learner, memory, replay, rollout, startup, train
 from deploy.bench.row import Row, text
 from learner import reference
-from learner.target_cache import Known
+from learner.target_cache import TargetValueCache
 from tmc.center.journal import Journal
 from tmc.center.replay import Replay
 from tmc.center.roster import Outbox
@@ -23,7 +23,7 @@ from tmc.kernel.config import build
 from tmc.kernel.world import World
 
 TINY = ("bench", "rollout", "--actors", "1,2", "--ticks", "50", "--repeats", "1")
-SMALL = ("replay.capacity=200", "dqn.target_updates=10", "dqn.batch=16", "network.channels=4,4")
+SMALL = ("replay.capacity=200", "dqn.target_updates=10", "dqn.batch_size=16", "network.channels=4,4")
 KEYS = {"bench", "case", "value", "unit", "reference", "ratio", "what"}
 MACHINE = {"platform", "processor", "cores", "load", "python", "numpy", "torch", "onnxruntime", "cores_worth"}
 
@@ -93,11 +93,11 @@ def test_journal_prints_a_line_of_json_a_figure(tmp_path: Path, capsys: pytest.C
         once |= {f"{case} x no commits": "records/s", f"{case} at 500 records/s": "share of a core"}
     for case in ("process", "power"):
         once |= {f"{case} commits": "commits/s", f"{case} commit": "ms, median"}
-    sealed = [f"{what}, sealed x as written" for what in ("all topics of all files", "flight records alone")]
-    assert units(rows) == once | dict.fromkeys(sealed, "bytes/UAV step")
+    compacted = [f"{what}, compacted x as written" for what in ("all topics of all files", "flight records alone")]
+    assert units(rows) == once | dict.fromkeys(compacted, "bytes/UAV step")
     assert rows["none x no commits"]["ratio"] == 1 and is_in_proportion(rows["power x no commits"])
-    assert all(is_in_proportion(rows[case]) and rows[case]["ratio"] <= 1 for case in sealed)
-    assert rows[sealed[1]]["value"] < rows[sealed[0]]["value"], "a part has more bytes than the whole"
+    assert all(is_in_proportion(rows[case]) and rows[case]["ratio"] <= 1 for case in compacted)
+    assert rows[compacted[1]]["value"] < rows[compacted[0]]["value"], "a part has more bytes than the whole"
     assert list(tmp_path.iterdir()) == []
     assert cli.main(["bench", "journal", "--dir", str(tmp_path / "gone")]) == 2
     assert "is no folder: choose one" in capsys.readouterr().err
@@ -131,7 +131,7 @@ def test_records_a_second_are_those_of_the_clock(tmp_path: Path, monkeypatch: py
 
 
 def test_replay_weighs_and_draws(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = rows_of(capsys, "replay", "--minibatches", "3", *changes("replay.capacity=9000", "dqn.batch=16"))
+    rows = rows_of(capsys, "replay", "--minibatches", "3", *changes("replay.capacity=9000", "dqn.batch_size=16"))
     cases = ("9,000 transitions", "9,000 transitions with priorities", "process above an empty one",
              "a minibatch of 16", "the fastest of them", "prioritised, and its update", "inserts")  # fmt: skip
     plain, prioritised, _, median, fastest, *_ = found = [rows[f"{case} of what is asked"] for case in cases]
@@ -146,7 +146,7 @@ def test_replay_weighs_and_draws(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_memory_of_twice_the_transitions_weighs_as_much_each() -> None:
     def each(capacity: int) -> float:
         world = World(build({"replay.capacity": capacity}))
-        memory = Replay(world, observation.Observer(world))
+        memory = Replay(world, observation.ObservationBuilder(world))
         inserted, _ = replay.fill(memory)
         assert capacity - 2 <= len(memory) <= inserted
         return replay.weight(memory)
@@ -173,7 +173,7 @@ def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str
     """
     turns = ["--repeats", "1", "--seconds", "0.3", "--threads", "1", "--steps", "40"]
     rows = rows_of(capsys, "learner", *turns, "--actors", "2", "--ticks", "200", *changes(*SMALL))
-    plain, tuned = (rows[f"N=2 threads=1 x bare loop{name}"] for name in ("", f" {learner.TUNED}"))
+    plain, tuned = (rows[f"N=2 threads=1 x textbook loop{name}"] for name in ("", f" {learner.TUNED}"))
     assert plain["unit"] == "updates/s" and is_in_proportion(plain) and is_in_proportion(tuned)
     assert plain["value"] == tuned["value"]
     assert CPU.items() <= units(rows).items()
@@ -181,21 +181,21 @@ def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str
     assert idle is None or 0 <= idle <= 1
     worst = rows["40 steps, worst weight x float32's bound"]
     assert worst["value"] <= worst["reference"] == 1 and is_in_proportion(worst)
-    assert is_in_proportion(rows["40 steps x bare loop's rounding"])
+    assert is_in_proportion(rows["40 steps x textbook loop's rounding"])
 
 
 def compared(**changes: Any) -> tuple[Row, Row]:
     """The rows of the comparison alone, for a small mission."""
-    small = {"replay.capacity": 200, "dqn.target_updates": 10, "dqn.batch": 16, "network.channels": (4, 4)}
+    small = {"replay.capacity": 200, "dqn.target_updates": 10, "dqn.batch_size": 16, "network.channels": (4, 4)}
     departure, worst = learner.compare(World(build({**learner.MISSION, **small, "team.size": 2, **changes})), 40)
     return departure, worst
 
 
 def test_a_wrong_learner_shows_in_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A value that is kept when theta- has followed: outside the bound, and far more than the bare loop's rounding."""
+    """A value that is kept when theta- has followed is outside the bound, and far more than rounding."""
     _, worst = compared()
     assert worst.value is not None and worst.value <= 1
-    monkeypatch.setattr(Known, "forget", lambda self: None)
+    monkeypatch.setattr(TargetValueCache, "forget", lambda self: None)
     departure, worst = compared()
     assert worst.value is not None and worst.value > 1
     assert departure.ratio is not None and departure.ratio > 1000
@@ -211,7 +211,7 @@ def test_results_without_any_rounding_have_no_ratio(
     monkeypatch.setattr(cores, "worth", lambda: None)
     monkeypatch.setattr(learner, "measure", lambda args: [departure, worst, Row("learner", "lost", float("nan"), "s")])
     rows = rows_of(capsys, "learner")
-    assert rows["40 steps x bare loop's rounding"]["ratio"] is None and rows["lost"]["value"] is None
+    assert rows["40 steps x textbook loop's rounding"]["ratio"] is None and rows["lost"]["value"] is None
     assert cli.main(["bench", "learner"]) == 0
     assert "nan" not in capsys.readouterr().out
 
@@ -239,9 +239,9 @@ def test_figures_of_several_turns_are_medians_and_ratios_are_taken_in_pairs() ->
 def test_train_counts_the_ticks_of_the_whole_recipe(capsys: pytest.CaptureFixture[str]) -> None:
     turns = ["--repeats", "1", "--seconds", "0.3", "--threads", "1", "--actors", "2"]
     rows = rows_of(capsys, "train", *turns, *changes(*SMALL))
-    assert is_in_proportion(rows["N=2 x bare loop"])
+    assert is_in_proportion(rows["N=2 x textbook loop"])
     assert units(rows) == {
-        "N=2 x bare loop": "ticks/s",
+        "N=2 x textbook loop": "ticks/s",
         "N=2 idle": "share of time",
         **dict.fromkeys(("N=2 learner", "N=2 tmc", "N=2 uavs"), "ms of CPU an update"),
         "N=2 start": "s to the first update",
@@ -261,7 +261,7 @@ def test_startup_says_how_long_a_user_waits(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_memory_is_told_by_role(capsys: pytest.CaptureFixture[str]) -> None:
-    small = ("replay.capacity=300", "dqn.batch=16", "network.channels=4,4", "replay.learn_start=40")
+    small = ("replay.capacity=300", "dqn.batch_size=16", "network.channels=4,4", "replay.learn_start=40")
     rows = rows_of(capsys, "memory", "--transitions", "100", "--actors", "2", "--ticks", "100", *changes(*small))
     whole, roles = rows["N=2 of what is asked"], [row for case, row in rows.items() if case.endswith("of all")]
     if whole["value"] is None:
@@ -289,7 +289,7 @@ def test_a_number_that_makes_no_sense_is_one_sentence(mistake: list[str], capsys
 
 
 def test_a_mission_that_is_over_before_it_is_measured_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["--ticks", "40", "--episodes", "1", "--set", "replay.learn_start=20", "--set", "dqn.batch=8"]
+    small = ["--ticks", "40", "--episodes", "1", "--set", "replay.learn_start=20", "--set", "dqn.batch_size=8"]
     assert cli.main(["bench", "learner", "--repeats", "1", "--threads", "1", "--seconds", "0.1", *small]) == 2
     assert "the mission was over before it was measured: give it more --episodes" in capsys.readouterr().err
 

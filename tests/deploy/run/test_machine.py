@@ -16,10 +16,10 @@ from deploy.run.progress import Progress
 from tests.command import LINE
 from tmc.center.replay import Replay
 from tmc.kernel.config import ConfigError, build
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 
-TEAM = build({"team.size": 30, "team.pilot": "planner:greedy"})
+TEAM = build({"team.size": 30, "team.controller": "planner:greedy"})
 
 
 def limited(limit: str, *words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -109,15 +109,15 @@ def test_what_is_asked_of_memory_is_less_than_the_replay_memory_takes() -> None:
     """So a mission that could fly is not refused."""
     config = build({"team.size": 3, "replay.capacity": 30_000, "replay.learn_start": 128})
     world = World(config)
-    replay = Replay(world, Observer(world))
+    replay = Replay(world, ObservationBuilder(world))
     rings = [value.data for value in vars(replay).values() if isinstance(getattr(value, "data", None), np.ndarray)]
     assert sum(ring.nbytes for ring in rings) >= machine.ROW_BYTES * 30_000
 
 
 @pytest.mark.parametrize("period", [1, 500])
 def test_what_is_asked_of_the_disk_is_less_than_a_flight_leaves(period: int, tmp_path: Path) -> None:
-    values = {"team.pilot": "planner:random-road", "team.size": 5, "training.ticks": 2000, "training.episodes": 1}
-    config = build({**values, "comms.period": period, "journal.commit": 5.0, "journal.flush": 5.0})
+    values = {"team.controller": "planner:random-road", "team.size": 5, "training.ticks": 2000, "training.episodes": 1}
+    config = build({**values, "comms.period": period, "journal.commit_interval": 5.0, "journal.flush_interval": 5.0})
     lockstep.run(World(config), tmp_path, None, Progress(config, 1, 0.0))
     need = next(n for n in machine.needs(config, learns=False, alone=True) if n.what == machine.DISK)
     assert need.amount <= (tmp_path / "tmc.mcap").stat().st_size

@@ -17,7 +17,7 @@ from deploy.run import supervisor as supervisors
 from deploy.run.forked import Forked, ForkServer, forkserver_command
 from deploy.run.plan import Child, Plan, make
 from deploy.run.supervisor import MissionFailed, Supervisor
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tmc.kernel.config import build
 from tmc.wire import process
 
@@ -67,7 +67,7 @@ def supervise(tmp_path: Path) -> Iterator[Callable[..., Supervisor]]:
 
 
 def watch_until(supervisor: Supervisor, done: Callable[[], bool]) -> None:
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while not done():
         assert time.monotonic() < until, "it did not happen"
         supervisor.watch()
@@ -83,7 +83,7 @@ def alive(pid: int) -> bool:
 
 
 def test_a_process_that_fails_is_started_again_with_back_off_and_then_given_up(supervise, monkeypatch) -> None:
-    monkeypatch.setattr(supervisors, "TRIES", 4)
+    monkeypatch.setattr(supervisors, "MAX_CRASHES", 4)
     supervisor = supervise(python("learner", "import sys; sys.exit(1)"))
     begin = time.monotonic()
     with pytest.raises(MissionFailed, match="learner ended with exit code 1"):
@@ -103,7 +103,7 @@ def test_a_mistake_is_not_tried_again(supervise, code: int) -> None:
 
 def test_a_full_disk_is_named_at_once(supervise, monkeypatch) -> None:
     """The process's own sentence finds no room in its file, and to start it again is no help."""
-    monkeypatch.setattr(supervisors, "FULL", 2**62)
+    monkeypatch.setattr(supervisors, "FULL_DISK_BYTES", 2**62)
     supervisor = supervise(python("tmc", "import sys; sys.exit(1)", leads=True))
     with pytest.raises(MissionFailed, match="is full; free some space, and go on with `overfly run --resume"):
         watch_until(supervisor, lambda: False)
@@ -131,14 +131,16 @@ def once(tmp_path: Path) -> Callable[[str, float, int], Child]:
 
 
 def test_who_left_before_the_tmc_was_back_is_started_again(supervise, once) -> None:
-    """Told that the mission is over, or that the TMC was stopped; the TMC's next life may need them all the same."""
+    """Told that the mission is over, or that the TMC was stopped; the TMC's next incarnation may need them all the
+    same.
+    """
     supervisor = supervise(once("tmc", 1.0, process.STOPPED), once("uav-000", 0.0, 0))
     watch_until(supervisor, lambda: supervisor.restarts() == {"tmc": 1, "uav-000": 1} and len(supervisor.pids()) == 2)
 
 
 def test_who_took_long_to_leave_a_tmc_that_was_killed_is_started_again(supervise, once, monkeypatch) -> None:
-    """Told that the mission is over by the TMC's last life. Who came after that is not called back."""
-    monkeypatch.setattr(supervisors, "OVERDUE", 1.0)
+    """Told that the mission is over by the TMC's last incarnation. PolicySpec came after that is not called back."""
+    monkeypatch.setattr(supervisors, "LEAVE_TIMEOUT_S", 1.0)
     supervisor = supervise(once("tmc", 0.5, process.STOPPED), once("learner", 4.0, 0))
     begin = time.monotonic()
     watch_until(supervisor, lambda: supervisor.restarts() == {"tmc": 1, "learner": 1})
@@ -153,18 +155,18 @@ def test_who_took_long_to_leave_a_tmc_that_was_killed_is_started_again(supervise
 def test_kills_from_outside_do_not_count(supervise, tmp_path: Path) -> None:
     supervisor = supervise(uav(0, tmp_path))
     seen: set[int] = set()
-    for _ in range(supervisors.TRIES + 4):
+    for _ in range(supervisors.MAX_CRASHES + 4):
         watch_until(supervisor, lambda: supervisor.pids().get("uav-000", -1) not in {*seen, -1})
         pid = supervisor.pids()["uav-000"]
         seen.add(pid)
         os.kill(pid, signal.SIGKILL)
         watch_until(supervisor, lambda pid=pid: not alive(pid))
-    watch_until(supervisor, lambda: supervisor.restarts() == {"uav-000": supervisors.TRIES + 4})
+    watch_until(supervisor, lambda: supervisor.restarts() == {"uav-000": supervisors.MAX_CRASHES + 4})
     assert any("uav-000 was killed by SIGKILL; it is started again" in note for note in supervisor.notes)
 
 
 def test_a_forked_uav_fails_like_any_other(supervise, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(supervisors, "TRIES", 2)
+    monkeypatch.setattr(supervisors, "MAX_CRASHES", 2)
     command = ("--id", "0", "--connect", "nowhere", "--out", str(tmp_path))
     wrong = Child("uav-000", command, restart=True, fork_of="actors")
     supervisor = supervise(wrong)
@@ -217,7 +219,7 @@ def test_a_killed_learner_is_forked_anew_by_a_process_that_has_no_threads(superv
 def test_a_forkserver_that_cannot_start_is_a_failure_not_a_kill(tmp_path: Path) -> None:
     server = ForkServer((sys.executable, "-c", "raise SystemExit(3)"), dict(os.environ), tmp_path / "forkserver.txt")
     child = server.start("uav-000", ["--id", "0"], tmp_path / "uav-000.txt")
-    assert isinstance(child, Forked) and child.wait(PATIENCE) == process.FAILED
+    assert isinstance(child, Forked) and child.wait(PATIENCE_S) == process.FAILED
     server.close()
 
 
@@ -238,26 +240,26 @@ command = (*{options}, "--connect", "{NOWHERE}", "--out", str(out))
 child = Child("{name}", command, True, fork_of="{package}")
 supervisor = Supervisor(Plan((child,), "", out / "tracks", out / "scratch"), out, 1, print)
 supervisor.start()
-until = time.monotonic() + {PATIENCE}
+until = time.monotonic() + {PATIENCE_S}
 while "{name}" not in supervisor.pids():
     assert time.monotonic() < until
     time.sleep(0.01)
 print(*supervisor.pids().values(), flush=True)
-time.sleep({PATIENCE})
+time.sleep({PATIENCE_S})
 """
     with subprocess.Popen([sys.executable, "-P", "-c", code], stdout=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None
         pids = [int(pid) for pid in run.stdout.readline().split()]
         assert len(pids) == 2 and all(alive(pid) for pid in pids)
         run.kill()
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + PATIENCE_S
     while any(alive(pid) for pid in pids):
         assert time.monotonic() < until, "a process outlived its supervisor"
         time.sleep(0.02)
 
 
 def test_what_a_killed_supervisor_left_in_memory_is_removed_by_the_next(tmp_path: Path) -> None:
-    config = build({"team.pilot": "planner:random"})
+    config = build({"team.controller": "planner:random"})
     living, dead = make(config, tmp_path, policy=None), make(config, tmp_path, policy=None)
     assert living.held is not None and dead.held is not None
     try:
@@ -319,7 +321,7 @@ def test_a_preloaded_module_that_starts_a_thread_is_left_out(tmp_path: Path) -> 
 
 
 def test_the_reason_of_a_crash_is_repeated_and_a_note_is_not(supervise, monkeypatch) -> None:
-    monkeypatch.setattr(supervisors, "TRIES", 1)
+    monkeypatch.setattr(supervisors, "MAX_CRASHES", 1)
     text = (
         "from tmc.wire.process import note, run_child\n"
         "def main():\n    note('it waits for something')\n    return 1 // 0\n"
@@ -338,7 +340,7 @@ def test_a_program_that_cannot_be_started_is_one_sentence(supervise, tmp_path: P
 
 def test_what_a_library_said_before_it_aborted_is_told(supervise, monkeypatch: pytest.MonkeyPatch) -> None:
     """As ZeroMQ does in a TMC that has no descriptor left."""
-    monkeypatch.setattr(supervisors, "TRIES", 2)
+    monkeypatch.setattr(supervisors, "MAX_CRASHES", 2)
     said = "Too many open files (src/ip_resolver.cpp:1)\\x1b[31m\\n"
     supervisor = supervise(python("tmc", f"import os; os.write(2, b'{said}'); os.abort()", leads=True))
     with pytest.raises(MissionFailed, match=r"tmc was killed by SIGABRT: Too many open files .*\\x1b\[31m; its output"):

@@ -1,4 +1,4 @@
-"""`overfly verify chaos`, part by part: the judge sees what is lost, doubled or other; blows, cuts and their seeds."""
+"""`overfly verify chaos`, part by part: the judge sees what is lost, doubled or other; faults, cuts and their seeds."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import pytest
 
 from deploy.cli import main
 from deploy.verify.chaos import proxy
-from deploy.verify.chaos.checker import Snapshot, judge
-from deploy.verify.chaos.faults import CUT, KILL, POWER, STOP, blows, role
+from deploy.verify.chaos.checker import Snapshot, check_delivery
+from deploy.verify.chaos.faults import CUT, KILL, POWER, STOP, draw_faults, role
 from deploy.verify.chaos.power import cut_tails
 from deploy.verify.chaos.proxy import Forwarder
-from deploy.verify.chaos.schedule import Growth, Storm
-from tests.command import PATIENCE
+from deploy.verify.chaos.schedule import FaultSchedule, Growth
+from tests.command import PATIENCE_S
 from tmc.kernel.config import Journal
 from tmc.record import builders
 from tmc.record.builders import record_digest
@@ -37,14 +37,14 @@ def record(uav: int, sequence: int, cell: int = 7) -> m.Record:
                     m.EMPTY, m.EMPTY)  # fmt: skip
 
 
-def prepare(out: Path, journalled: list[m.Record], sworn: list[m.Record]) -> None:
-    """A run folder in which the TMC has journalled these records, and the UAVs have sworn to those."""
-    (out / "oaths").mkdir(parents=True)
+def prepare(out: Path, journalled: list[m.Record], acknowledged: list[m.Record]) -> None:
+    """A run folder in which the TMC has journalled these records, and the UAVs have acknowledged to those."""
+    (out / "acks").mkdir(parents=True)
     with LogWriter(out / "tmc.mcap", "tmc", Journal(), {}) as log:
         for one in journalled:
             log.write(f"/uav/{one.uav}/record", builders.flight_record(one))
-    for one in sworn:
-        with (out / "oaths" / f"uav-{one.uav:03d}.txt").open("a") as file:
+    for one in acknowledged:
+        with (out / "acks" / f"uav-{one.uav:03d}.txt").open("a") as file:
             file.write(f"{one.sequence} {record_digest(one)}\n")
 
 
@@ -52,25 +52,25 @@ FLOWN = [record(uav, sequence) for sequence in range(4) for uav in range(2)]
 
 
 def test_what_was_sworn_and_is_there_is_neither_lost_nor_doubled(tmp_path: Path) -> None:
-    prepare(tmp_path, FLOWN, [*FLOWN[:6], replace(FLOWN[6], life=99)])  # another life, the same flight
-    found = judge(tmp_path)
+    prepare(tmp_path, FLOWN, [*FLOWN[:6], replace(FLOWN[6], incarnation=99)])  # another incarnation, the same flight
+    found = check_delivery(tmp_path)
     assert (found.acknowledged, found.journalled, found.lost, found.doubled) == (7, 8, 0, 0)
 
 
 def test_a_lost_record_is_seen(tmp_path: Path) -> None:
     prepare(tmp_path, FLOWN[:7], FLOWN)
-    found = judge(tmp_path)
+    found = check_delivery(tmp_path)
     assert (found.acknowledged, found.journalled, found.lost, found.doubled) == (8, 7, 1, 0)
 
 
 def test_a_doubled_record_is_seen(tmp_path: Path) -> None:
     prepare(tmp_path, [*FLOWN, FLOWN[3], FLOWN[3], FLOWN[5]], FLOWN)
-    assert (judge(tmp_path).lost, judge(tmp_path).doubled) == (0, 2)
+    assert (check_delivery(tmp_path).lost, check_delivery(tmp_path).doubled) == (0, 2)
 
 
 def test_another_digest_is_seen(tmp_path: Path) -> None:
     prepare(tmp_path, [record(0, 0, cell=8), *FLOWN[1:]], FLOWN)
-    assert (judge(tmp_path).lost, judge(tmp_path).doubled) == (1, 0)
+    assert (check_delivery(tmp_path).lost, check_delivery(tmp_path).doubled) == (1, 0)
 
 
 def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same(tmp_path: Path) -> None:
@@ -80,10 +80,10 @@ def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same
     with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
         for one in FLOWN:
             log.write(f"/uav/{one.uav}/record", builders.flight_record(one))
-    assert judge(tmp_path).lost == 0
+    assert check_delivery(tmp_path).lost == 0
     assert snapshot.lost() == {(0, 2), (1, 2), (0, 3)}
-    assert judge(tmp_path, [(0, 2), (1, 2), (0, 3)]).lost == 3
-    assert not list((tmp_path / "oaths").glob("killed*"))
+    assert check_delivery(tmp_path, [(0, 2), (1, 2), (0, 3)]).lost == 3
+    assert not list((tmp_path / "acks").glob("killed*"))
 
 
 # Blows.
@@ -91,25 +91,25 @@ def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same
 
 @pytest.mark.parametrize("power", [False, True])
 def test_blows_are_drawn_from_their_seed(power: bool) -> None:
-    drawn = blows(200, 4, NAMES, power=power)
-    assert drawn == blows(200, 4, NAMES, power=power) != blows(200, 5, NAMES, power=power)
-    assert sum(blow.kills for blow in drawn) == 200
-    kinds = Counter(blow.kind for blow in drawn)
+    drawn = draw_faults(200, 4, NAMES, power=power)
+    assert drawn == draw_faults(200, 4, NAMES, power=power) != draw_faults(200, 5, NAMES, power=power)
+    assert sum(fault.kills for fault in drawn) == 200
+    kinds = Counter(fault.kind for fault in drawn)
     assert kinds[STOP] > 30 and kinds[CUT] > 30 and (kinds[POWER] > 60 if power else not kinds[POWER])
-    killed = Counter(role(name) for blow in drawn if blow.kind == KILL for name in blow.targets)
+    killed = Counter(role(name) for fault in drawn if fault.kind == KILL for name in fault.targets)
     assert min(killed.values()) > 0.6 * max(killed.values()) and set(killed) == {"tmc", "learner", "uav"}
-    assert any(len(blow.targets) == 2 for blow in drawn) and all(0.1 <= blow.seconds <= 1.0 for blow in drawn)
+    assert any(len(fault.targets) == 2 for fault in drawn) and all(0.1 <= fault.seconds <= 1.0 for fault in drawn)
 
 
 def test_what_a_missions_end_left_of_a_blow_falls_on_the_next_mission(tmp_path: Path) -> None:
-    storm = Storm(blows(1, 1, ["tmc"], power=False), lambda _: None, tmp_path / "diary.txt")
-    assert storm.next is not None
-    blow = storm.next
-    storm.struck()
-    storm.later(replace(blow, targets=()))
-    assert storm.next is None or storm.next.kind != KILL
-    storm.later(blow)
-    assert storm.next == blow
+    schedule = FaultSchedule(draw_faults(1, 1, ["tmc"], power=False), lambda _: None, tmp_path / "diary.txt")
+    assert schedule.next is not None
+    fault = schedule.next
+    schedule.started()
+    schedule.later(replace(fault, targets=()))
+    assert schedule.next is None or schedule.next.kind != KILL
+    schedule.later(fault)
+    assert schedule.next == fault
 
 
 def test_updates_that_a_checkpoint_takes_back_are_no_growth() -> None:
@@ -126,10 +126,10 @@ def test_updates_that_a_checkpoint_takes_back_are_no_growth() -> None:
 
 def test_a_power_cut_leaves_what_was_synced(tmp_path: Path) -> None:
     journal, draw, left = tmp_path / "tmc.mcap.active", Random(1), set[int]()
-    (tmp_path / "oaths").mkdir()
+    (tmp_path / "acks").mkdir()
     for _ in range(50):
         journal.write_bytes(bytes(range(200)))
-        (tmp_path / "oaths" / "tmc.txt").write_text(f"7 400\n{journal.stat().st_ino} 120\n")
+        (tmp_path / "acks" / "tmc.txt").write_text(f"7 400\n{journal.stat().st_ino} 120\n")
         (tmp_path / "uav-000.mcap.active").write_bytes(bytes(100))
         lost = cut_tails(tmp_path, draw)
         left.add(journal.stat().st_size)
@@ -141,8 +141,8 @@ def test_a_power_cut_leaves_what_was_synced(tmp_path: Path) -> None:
 def test_a_journal_that_was_just_taken_over_was_synced_as_a_whole(tmp_path: Path) -> None:
     journal = tmp_path / "tmc.mcap.active"
     journal.write_bytes(bytes(200))
-    (tmp_path / "oaths").mkdir()
-    (tmp_path / "oaths" / "tmc.txt").write_text(f"{journal.stat().st_ino + 1} 20\n")
+    (tmp_path / "acks").mkdir()
+    (tmp_path / "acks" / "tmc.txt").write_text(f"{journal.stat().st_ino + 1} 20\n")
     assert cut_tails(tmp_path, Random(1)) == 0 and journal.stat().st_size == 200
 
 
@@ -163,7 +163,7 @@ def line(short: Path) -> Iterator[tuple[Forwarder, socket.socket, Path]]:
 
 def call(front: Path) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX)
-    sock.settimeout(PATIENCE)
+    sock.settimeout(PATIENCE_S)
     sock.connect(str(front))
     return sock
 
@@ -192,7 +192,7 @@ def test_bytes_pass_both_ways_until_they_are_cut_off(
         assert refused.recv(1) == b""
     now[0] += 0.31
     with call(front) as again:
-        listener.settimeout(PATIENCE)
+        listener.settimeout(PATIENCE_S)
         server, _ = listener.accept()
         again.sendall(b"here")
         assert server.recv(10) == b"here"

@@ -165,7 +165,7 @@ def test_the_one_that_is_held_back_starts_alone_or_among_the_others(tmp_path: Pa
     path = tmp_path / "corners.txt"
     path.write_text(raster)
     trial = asynchrony.Trial("", apart=apart, period=10, ticks=20)
-    config, held_back = asynchrony.config_of(trial, team, 0.1, {"team.pilot": "planner:greedy"}, path)
+    config, held_back = asynchrony.config_of(trial, team, 0.1, {"team.controller": "planner:greedy"}, path)
     assert (config.trial.stall, config.trial.stall_uav) == (0.1, held_back)
     starts = exactness.check(config).starts(1)
     chebyshev = Grid(asynchrony.SIDE, asynchrony.SIDE).chebyshev
@@ -173,7 +173,7 @@ def test_the_one_that_is_held_back_starts_alone_or_among_the_others(tmp_path: Pa
     assert min(away) > 95 if apart else max(away) < 15
 
 
-QUICK = {"team.pilot": "planner:greedy", "training.episodes": 1}
+QUICK = {"team.controller": "planner:greedy", "training.episodes": 1}
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_a_lead_that_no_rule_allows_is_seen(monkeypatch: pytest.MonkeyPatch, tmp
     facts = {(1, t, compare.KINDS.index("cell"), i): 10 + i for t in range(10) for i in range(2)}
     status = type("Status", (), {"lead_most": 5, "lead_tick": 7, "lead_bound": "distance"})
     monkeypatch.setattr(asynchrony, "run_files", lambda _: {"uav-001": tmp_path})
-    monkeypatch.setattr(asynchrony, "read", lambda *_: [type("Entry", (), {"message": status})])
+    monkeypatch.setattr(asynchrony, "read", lambda *_: [type("LogMessage", (), {"message": status})])
     ahead = asynchrony.farthest(config, facts, tmp_path, 0)
     assert (ahead.ticks, ahead.uav, ahead.at, ahead.cells, ahead.right) == (5, 1, 7, 1, False)
     result = asynchrony.Result(asynchrony.TRIALS[3], 0, ahead, 1.0, None)

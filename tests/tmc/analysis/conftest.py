@@ -21,7 +21,7 @@ SMALL = {
     "training.seed": 3,
     "training.episodes": 1,
     "team.size": 3,
-    "team.pilot": "planner:random",
+    "team.controller": "planner:random",
 }
 """At random, so that moves are blocked for every cause, and UAVs leave the roads."""
 
@@ -63,7 +63,7 @@ def flown_as(old: Path, new: Path, change: dict[str, object]) -> None:
 def learned(fly: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that looks like training, without torch: three random episodes, and the log of a learner."""
     folder = tmp_path_factory.mktemp("learned") / "run"
-    flown_as(fly(**{"training.episodes": 3}), folder, {"team.pilot": "policy"})
+    flown_as(fly(**{"training.episodes": 3}), folder, {"team.controller": "policy"})
     with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
         for n in range(1, 181):
             metrics = schemas.LearnerMetrics(updates=n, loss=1 / n, q_mean=n / 20, target_mean=n / 19)

@@ -1,4 +1,4 @@
-"""`overfly log check`: sound journals of all kinds pass; one that breaks an invariant is caught by that invariant."""
+"""`overfly log check`: intact journals of all kinds pass; one that breaks an invariant is caught by that invariant."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_sound_journals_pass(fly: Fly, values: dict[str, object]) -> None:
 
 def lose_one(folder: Path, dies: int, **values: Any) -> Path:
     """A mission in which UAV 2's process is silent from tick `dies` of episode 1 on, and back in episode 3."""
-    config = build({"team.pilot": "planner:greedy", "team.size": 4, "training.ticks": 60, "training.episodes": 3,
+    config = build({"team.controller": "planner:greedy", "team.size": 4, "training.ticks": 60, "training.episodes": 3,
                     "comms.period": 7, "training.seed": 5, **values})  # fmt: skip
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(flat(config)))
@@ -92,10 +92,10 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
         moved = False
         for pilot in pilots:
             if pilot.uav == 2 and pilot.episode == 1 and pilot.t >= dies:
-                away = station.flight is None or station.flight.episode == 1
+                away = station.episode is None or station.episode.number == 1
                 if away:
                     continue
-                pilot.episode, pilot.life, pilot.phase = 0, 2, type(pilot.phase).IDLE
+                pilot.episode, pilot.incarnation, pilot.phase = 0, 2, type(pilot.phase).IDLE
                 deliver(step._exchange(2, m.Hello("uav", 2, 2)))
             before = (pilot.t, pilot.phase)
             try:
@@ -120,7 +120,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
 def test_a_journal_with_a_lost_uav_passes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dies: int, scenario: int, phase: str
 ) -> None:
-    monkeypatch.setattr("actors.pilot.STINT", 1)  # it is seen in places that its records do not tell of
+    monkeypatch.setattr("actors.pilot.MAX_TICKS_PER_ADVANCE", 1)  # it is seen in places that its records do not tell of
     folder = lose_one(tmp_path / "run", dies, scenario=scenario, **{"comms.phase": phase})
     assert [e.message.uav for e in Log(folder / "tmc.mcap").entries(["/tmc/lost"])] == [2, 2]
     result = check(folder)
@@ -156,7 +156,7 @@ def test_a_journal_that_ends_anywhere_is_checked_as_far_as_it_goes(
 
 
 def altered(folder: Path, to: Path, change: Change) -> Path:
-    """A copy of a run's journal, sound as a file; `change` gives the messages that stand for a message."""
+    """A copy of a run's journal, intact as a file; `change` gives the messages that stand for a message."""
     to.mkdir()
     shutil.copy(folder / "config.json", to)
     old = Log(folder / "tmc.mcap")
@@ -263,7 +263,7 @@ def stay_instead(message: Any) -> bool:
 
 def other_blocked_action(fly: Fly, values: dict[str, Any]) -> Change:
     """A move that a UAV blocked is said to have been another one, the way of which was free."""
-    world = World(build({"team.pilot": "planner:random", **values}))
+    world = World(build({"team.controller": "planner:random", **values}))
     cells: dict[tuple[int, int, int], int] = {}
     for e in Log(fly(**values) / "tmc.mcap").entries():
         if e.topic.endswith("/record"):
@@ -287,7 +287,7 @@ def other_blocked_action(fly: Fly, values: dict[str, Any]) -> Change:
 
 def onto_another(fly: Fly, values: dict[str, Any]) -> Change:
     """At the last tick, one that stays beside another is put onto it."""
-    world = World(build({"team.pilot": "planner:random", **values}))
+    world = World(build({"team.controller": "planner:random", **values}))
     T, last = 60, dict[int, int]()
     for e in Log(fly(**values) / "tmc.mcap").entries():
         if e.topic.endswith("/record") and e.message.episode == 2 and e.message.tick == T:

@@ -20,7 +20,7 @@ from tmc.kernel.roadmap import load_map, parse_raster
 from tmc.record import facts
 from tmc.record.errors import RecordError
 
-SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
+SCENARIO_1 = {"scenario": 1, "team.controller": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 
 
 def colours(path):

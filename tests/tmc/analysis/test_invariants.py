@@ -17,7 +17,7 @@ from tmc.analysis.invariants.episode_log import Gathering
 from tmc.analysis.invariants.recompute import truth
 from tmc.analysis.run_config import world_of
 from tmc.kernel.world import World
-from tmc.record.reader import Entry, Log
+from tmc.record.reader import Log, LogMessage
 
 Fly = Callable[..., Path]
 MISSIONS: list[dict[str, object]] = [
@@ -26,7 +26,7 @@ MISSIONS: list[dict[str, object]] = [
     {"team.size": 5, "training.ticks": 20, "comms.period": 7, "comms.phase": "staggered", "reward.uncertainty": "own"},
 ]
 NO_FACTS = frozenset((
-    "life", "policy", "updates", "epsilon", "elapsed",  # how the flight came about
+    "incarnation", "policy", "updates", "epsilon", "elapsed",  # how the flight came about
     "timestamp", "frame_id", "pose", "cell_size", "fields",  # how a map is drawn
 ))  # fmt: skip
 TOPICS = ("/uav/", "/tmc/sync", "/tmc/episode", "/tmc/events", "/tmc/metrics", "/tmc/last_visit")
@@ -35,7 +35,7 @@ FLOATS = (1, 2)
 """Kinds of protobuf fields: double and float."""
 
 
-def violated(world: World, entries: list[Entry]) -> set[str]:
+def violated(world: World, entries: list[LogMessage]) -> set[str]:
     """The invariants that do not hold."""
     found = set()
     for e in Gathering(world).episodes(entries):
@@ -45,7 +45,7 @@ def violated(world: World, entries: list[Entry]) -> set[str]:
 
 
 @cache
-def journal(folder: Path) -> tuple[World, list[Entry]]:
+def journal(folder: Path) -> tuple[World, list[LogMessage]]:
     world, _ = world_of(folder, folder / "tmc.mcap")
     entries = [e for e in Log(folder / "tmc.mcap").entries() if e.topic.startswith(TOPICS)]
     assert violated(world, entries) == set()

@@ -23,7 +23,7 @@ from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 from tmc.wire.messages import Hello
 
-SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
+SCENARIO_1 = {"scenario": 1, "team.controller": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 
 
 def world_of(folder):
@@ -302,7 +302,7 @@ def test_reading_changes_nothing(fly):
 @pytest.mark.parametrize("ticks", [0, 20])
 def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, tmp_path):
     """UAV 1 is gone from the first episode's start on; with `ticks` 0, so is UAV 0 after the start of the second."""
-    config = build({"team.size": 2, "team.pilot": "planner:greedy", "training.episodes": 2, "training.ticks": 20})
+    config = build({"team.size": 2, "team.controller": "planner:greedy", "training.episodes": 2, "training.ticks": 20})
     (tmp_path / "config.json").write_text(json.dumps(flat(config)))
     journal = TmcJournal(tmp_path, world := World(config), "run")
     mission = LockStep(world, None, journal.take)

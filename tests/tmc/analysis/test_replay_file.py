@@ -24,7 +24,7 @@ from actors.airspace import Waiting
 from actors.pilot import Pilot
 from deploy import cli
 from deploy.run.lockstep import LockStep
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tests.tmc.analysis.conftest import flown_as
 from tmc.analysis import palette
 from tmc.analysis.viewer import replay_file
@@ -43,7 +43,7 @@ from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 
 T, N = 60, 3
-BASE = {"training.ticks": T, "training.episodes": 2, "team.size": N, "team.pilot": "planner:random-road",
+BASE = {"training.ticks": T, "training.episodes": 2, "team.size": N, "team.controller": "planner:random-road",
         "training.seed": 3}  # fmt: skip
 MISSIONS: dict[str, dict[str, Any]] = {
     "together": {},
@@ -51,14 +51,14 @@ MISSIONS: dict[str, dict[str, Any]] = {
     "every tick": {"comms.period": 1},
     "never": {"comms.period": 1000},
     "random map": {"world.initial_map": "random", "world.rates": "volume", "comms.phase": "staggered"},
-    "blocked": {"team.pilot": "planner:random", "team.size": 12},
+    "blocked": {"team.controller": "planner:random", "team.size": 12},
     "events": {"scenario": 1, "world.alpha": 0.2},
     "events, alone": {"scenario": 1, "team.size": 1, "world.alpha": 0.05},
 }
 
 
 @dataclass
-class Flown:
+class RunData:
     """A mission in lock step with its log, and what its pilots held when they were about to act."""
 
     folder: Path
@@ -80,11 +80,11 @@ class Flown:
         pilot._act = MethodType(noting, pilot)  # type: ignore[method-assign]
 
 
-def fly(folder: Path, fleet: Callable[[LockStep], None] = LockStep.run, **values: Any) -> Flown:
+def fly(folder: Path, fleet: Callable[[LockStep], None] = LockStep.run, **values: Any) -> RunData:
     """Fly a mission in lock step, with its journal."""
     folder.mkdir(parents=True)
     world = World(build({**BASE, **values}))
-    flown, journal = Flown(folder, world), Journal(folder, world, "run")
+    flown, journal = RunData(folder, world), Journal(folder, world, "run")
     mission = LockStep(world, None, journal.take)
     for pilot in mission.fleet.pilots:
         flown.watch(pilot)
@@ -94,12 +94,12 @@ def fly(folder: Path, fleet: Callable[[LockStep], None] = LockStep.run, **values
 
 
 @pytest.fixture(scope="module", params=MISSIONS)
-def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flown:
+def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunData:
     return fly(tmp_path_factory.mktemp("flown") / "run", **MISSIONS[request.param])
 
 
 @pytest.fixture(scope="module")
-def together(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+def together(tmp_path_factory: pytest.TempPathFactory) -> RunData:
     return fly(tmp_path_factory.mktemp("together") / "run")
 
 
@@ -142,7 +142,7 @@ def true_last_visits(folder: Path, world: World, episode: int) -> list[dict[int,
     return visits
 
 
-def test_the_true_map_of_each_tick_follows_from_the_moves(flown: Flown) -> None:
+def test_the_true_map_of_each_tick_follows_from_the_moves(flown: RunData) -> None:
     world, found = flown.world, messages(replay(flown.folder))
     visits = true_last_visits(flown.folder, world, 2)
     grids = ticks_of(found, "/tmc/last_visit")
@@ -153,7 +153,7 @@ def test_the_true_map_of_each_tick_follows_from_the_moves(flown: Flown) -> None:
         assert builders.last_visit(grid).tolist() == expected
 
 
-def test_the_uncertainty_of_the_true_map_is_what_the_tmc_logged(flown: Flown) -> None:
+def test_the_uncertainty_of_the_true_map_is_what_the_tmc_logged(flown: RunData) -> None:
     found, logged = messages(replay(flown.folder)), dict(facts.uncertainty(flown.folder, 2))
     for tick, grid in ticks_of(found, "/tmc/last_visit"):
         assert builders.layer(grid, "uncertainty").sum(dtype=np.float64) == pytest.approx(logged[tick], rel=1e-5)
@@ -164,7 +164,7 @@ def test_the_uncertainty_of_the_true_map_is_what_the_tmc_logged(flown: Flown) ->
         assert message.uavs == flown.world.config.team.size
 
 
-def test_events_are_where_they_are_until_somebody_comes(flown: Flown) -> None:
+def test_events_are_where_they_are_until_somebody_comes(flown: RunData) -> None:
     if flown.world.config.scenario == 2:
         return
     found, active = messages(replay(flown.folder)), set[int]()
@@ -181,7 +181,7 @@ def test_events_are_where_they_are_until_somebody_comes(flown: Flown) -> None:
     assert most > 10
 
 
-def test_a_belief_is_what_the_pilot_held(flown: Flown) -> None:
+def test_a_belief_is_what_the_pilot_held(flown: RunData) -> None:
     world, found = flown.world, messages(replay(flown.folder))
     for uav in range(world.config.team.size):
         grids = ticks_of(found, f"/uav/{uav}/belief")
@@ -196,7 +196,7 @@ def test_a_belief_is_what_the_pilot_held(flown: Flown) -> None:
             assert message.believed == pytest.approx(float(flown.own[2, tick, uav].sum()), rel=1e-12)
 
 
-def test_beliefs_of_the_tmc_are_those_that_it_logged(flown: Flown) -> None:
+def test_beliefs_of_the_tmc_are_those_that_it_logged(flown: RunData) -> None:
     """At each exchange the plot of what the TMC believes passes through what /tmc/sync says."""
     believed = {t: message.believed for t, message in ticks_of(messages(replay(flown.folder)), "/tmc/tick")}
     synced = [e.message for e in Log(run_files(flown.folder)["tmc"]).entries(["/tmc/sync"]) if e.message.episode == 2]
@@ -205,7 +205,7 @@ def test_beliefs_of_the_tmc_are_those_that_it_logged(flown: Flown) -> None:
         assert believed[sync.tick] == pytest.approx(sync.believed, rel=1e-12)
 
 
-def test_where_everybody_is(flown: Flown) -> None:
+def test_where_everybody_is(flown: RunData) -> None:
     world, found = flown.world, messages(replay(flown.folder))
     cells = {(tick, uav): cell for tick, uav, cell in facts.moves(flown.folder, 2)}
     for uav in range(world.config.team.size):
@@ -224,7 +224,7 @@ def test_where_everybody_is(flown: Flown) -> None:
             assert (message.longitude, message.latitude) == world.map.lonlat(cells[tick, uav])
 
 
-def test_the_scene_shows_each_uav_with_its_trail(flown: Flown) -> None:
+def test_the_scene_shows_each_uav_with_its_trail(flown: RunData) -> None:
     found, size = messages(replay(flown.folder)), flown.world.config.team.size
     cells = {(tick, uav): cell for tick, uav, cell in facts.moves(flown.folder, 2)}
     assert len(found["/scene"]) == T + 1
@@ -241,7 +241,7 @@ def test_the_scene_shows_each_uav_with_its_trail(flown: Flown) -> None:
             assert len(getattr(entity, SHAPES[uav // len(palette.UAV_COLOURS)][0])) == 1
 
 
-def test_blocked_moves_and_exchanges_are_said(flown: Flown) -> None:
+def test_blocked_moves_and_exchanges_are_said(flown: RunData) -> None:
     found = messages(replay(flown.folder))
     blocked = sum(message.blocked for _, message in found["/tmc/tick"])
     assert sum("was blocked by" in message.message for _, message in found["/log"]) == blocked
@@ -255,7 +255,7 @@ def test_blocked_moves_and_exchanges_are_said(flown: Flown) -> None:
     assert exchanges == due
 
 
-def test_the_file_holds_the_topics_of_the_table_in_order_of_time(flown: Flown) -> None:
+def test_the_file_holds_the_topics_of_the_table_in_order_of_time(flown: RunData) -> None:
     path = replay(flown.folder)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
@@ -274,7 +274,7 @@ def test_the_file_holds_the_topics_of_the_table_in_order_of_time(flown: Flown) -
     assert attachment.data == path.with_suffix(".layout.json").read_bytes()
 
 
-def test_sub_messages_that_are_zero_are_there(flown: Flown) -> None:
+def test_sub_messages_that_are_zero_are_there(flown: RunData) -> None:
     """Converters of viewers look for them."""
     found = messages(replay(flown.folder))
     (_, tf), (_, grid), (_, scene) = found["/tf"][0], found["/tmc/last_visit"][0], found["/scene"][0]
@@ -286,7 +286,7 @@ def test_sub_messages_that_are_zero_are_there(flown: Flown) -> None:
         assert entity.lines[0].pose.HasField("position") and entity.lines[0].pose.HasField("orientation")
 
 
-def test_the_layout_names_only_topics_of_the_file_and_every_panel_of_it_is_described(flown: Flown) -> None:
+def test_the_layout_names_only_topics_of_the_file_and_every_panel_of_it_is_described(flown: RunData) -> None:
     path = replay(flown.folder)
     layout = json.loads(path.with_suffix(".layout.json").read_text())
     found, size = messages(path), flown.world.config.team.size
@@ -331,7 +331,7 @@ def losing(mission: LockStep) -> None:
     for pilot in fleet.pilots:
         for uav, reply in mission._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
             fleet.deliver(uav, reply)
-    while station.flight is None or station.flight.episode == 1:
+    while station.episode is None or station.episode.number == 1:
         moved = False
         for pilot in fleet.pilots:
             if pilot.uav == 1 and pilot.t >= 25:
@@ -376,7 +376,7 @@ def test_a_lost_uav_is_there_until_its_last_record(tmp_path: Path) -> None:
             assert builders.last_visit(grid)[flown.world.law.cells].tolist() == held.tolist()
 
 
-def test_a_cut_log_is_replayed_as_far_as_it_goes(together: Flown, tmp_path: Path) -> None:
+def test_a_cut_log_is_replayed_as_far_as_it_goes(together: RunData, tmp_path: Path) -> None:
     whole = messages(replay(together.folder))
     world = World(build({**BASE, "journal.chunk": 2048, "training.ticks": 400}))
     long = tmp_path / "long"
@@ -397,12 +397,12 @@ def test_a_cut_log_is_replayed_as_far_as_it_goes(together: Flown, tmp_path: Path
     assert (again.damage, again.ticks, again.whole) == (None, made.flown.ticks, False)
 
 
-def test_the_same_log_gives_the_same_file(together: Flown, tmp_path: Path) -> None:
+def test_the_same_log_gives_the_same_file(together: RunData, tmp_path: Path) -> None:
     first, again = (replay_file.write(together.folder, 1, tmp_path / name).path for name in ("1.mcap", "2.mcap"))
     assert first.read_bytes() == again.read_bytes()
 
 
-def test_the_command(together: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(together: RunData, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["log", "replay", str(together.folder), "--episode", "1"]) == 0
     said = capsys.readouterr()
     path = together.folder / "replay" / "episode-000001.mcap"
@@ -421,7 +421,7 @@ def test_the_command(together: Flown, tmp_path: Path, capsys: pytest.CaptureFixt
     assert cli.main(["log", "replay", str(tmp_path / "nowhere")]) == 2
 
 
-def test_a_log_that_does_not_fit_its_config_is_refused(together: Flown, tmp_path: Path) -> None:
+def test_a_log_that_does_not_fit_its_config_is_refused(together: RunData, tmp_path: Path) -> None:
     for key, value in (("team.size", 2), ("training.ticks", 30)):
         flown_as(together.folder, tmp_path / key, {key: value})
         with pytest.raises(RecordError, match="the log does not fit its config"):
@@ -442,7 +442,7 @@ WRONG: list[tuple[str, Callable[[Any], object]]] = [
 
 @pytest.mark.parametrize(("topic", "change"), WRONG)
 def test_a_log_that_cannot_be_true_is_refused_in_a_sentence(
-    together: Flown, tmp_path: Path, topic: str, change: Callable[[Any], object]
+    together: RunData, tmp_path: Path, topic: str, change: Callable[[Any], object]
 ) -> None:
     config = (json.dumps(BASE)).encode()
     with LogWriter(tmp_path / "tmc.mcap", "tmc", together.world.config.journal, {}) as log:
@@ -455,13 +455,13 @@ def test_a_log_that_cannot_be_true_is_refused_in_a_sentence(
         replay_file.write(tmp_path, 1, tmp_path / "out.mcap")
 
 
-def test_rerun_finds_every_topic_in_order(together: Flown) -> None:
+def test_rerun_finds_every_topic_in_order(together: RunData) -> None:
     rerun = Path(sys.executable).with_name("rerun")
     if not rerun.exists():
         pytest.skip("rerun-sdk is not installed")
     path = replay(together.folder)
     done = subprocess.run(
-        [rerun, "mcap", "check", path], capture_output=True, text=True, timeout=PATIENCE, check=True,
+        [rerun, "mcap", "check", path], capture_output=True, text=True, timeout=PATIENCE_S, check=True,
         env=os.environ | {"RUST_LOG": "error"},
     )  # fmt: skip
     rows = [line.split() for line in done.stdout.splitlines() if " /" in line]

@@ -7,7 +7,7 @@ import pytest
 from tmc.analysis.metrics import summary
 from tmc.analysis.report.text import pictures, text
 
-SCENARIO_1 = {"scenario": 1, "team.pilot": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
+SCENARIO_1 = {"scenario": 1, "team.controller": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
 
 
 @pytest.fixture(params=["fly", "events", "training"])

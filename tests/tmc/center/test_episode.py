@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tmc.center.episode import Exchange, Flight, RefusedError, Truth
+from tmc.center.episode import EpisodeState, Exchange, FinalTicks, RefusedError
 from tmc.center.replay import Replay, Ring
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.reward import Block, RewardLaw
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
@@ -158,57 +158,59 @@ class Referee:
 
 
 @pytest.fixture(scope="module", params=list(CASES))
-def case(request: pytest.FixtureRequest, mission: Callable[..., Any], town: RoadMap) -> tuple[Any, Flight, Referee]:
-    """A mission of one episode in a random interleaving, its flight, and the referee's account of it."""
+def case(
+    request: pytest.FixtureRequest, mission: Callable[..., Any], town: RoadMap
+) -> tuple[Any, EpisodeState, Referee]:
+    """A mission of one episode in a random interleaving, its episode, and the referee's account of it."""
     values = {"team.size": N, "training.ticks": T, "replay.capacity": 10_000, **CASES[request.param]}
     flown = mission(values, town)
     flights = set()
     for _ in flown.steps(Random(request.param)):
-        flights |= {flown.station.flight} - {None}
-    (flight,), tracks = flights, flown.flown()
-    return flown, flight, Referee(flown.world, [tracks[1, i] for i in range(N)])
+        flights |= {flown.station.episode} - {None}
+    (episode,), tracks = flights, flown.flown()
+    return flown, episode, Referee(flown.world, [tracks[1, i] for i in range(N)])
 
 
 def entries(flown: Any, topic: str, key: str) -> list[Any]:
     return [x for e in flown.entries if e.topic == topic for x in e.values[key]]
 
 
-def test_uncertainty_of_every_tick(case: tuple[Any, Flight, Referee]) -> None:
-    flown, flight, referee = case
+def test_uncertainty_of_every_tick(case: tuple[Any, EpisodeState, Referee]) -> None:
+    flown, episode, referee = case
     assert entries(flown, "/tmc/metrics", "uncertainty") == pytest.approx(referee.sums, abs=1e-9)
-    assert flight.total_uncertainty == pytest.approx(sum(referee.sums[1:]), abs=1e-7)
+    assert episode.total_uncertainty == pytest.approx(sum(referee.sums[1:]), abs=1e-7)
     assert flown.station.episode_uncertainty == pytest.approx(sum(referee.sums[1:]) / T, abs=1e-9)
 
 
-def test_rewards_of_every_move(case: tuple[Any, Flight, Referee]) -> None:
-    flown, flight, referee = case
+def test_rewards_of_every_move(case: tuple[Any, EpisodeState, Referee]) -> None:
+    flown, episode, referee = case
     given_ = flown.station.replay.rewards[np.arange(1, T + 1)]
     assert given_.ravel().tolist() == pytest.approx(np.array(referee.rewards).ravel().tolist(), rel=1e-6, abs=1e-6)
     assert not flown.station.replay.rewards[np.arange(1)].any()
-    assert flight.total_reward == pytest.approx(np.array(referee.rewards).sum(axis=0).tolist(), abs=1e-4)
+    assert episode.total_reward == pytest.approx(np.array(referee.rewards).sum(axis=0).tolist(), abs=1e-4)
     mean = np.array(referee.rewards).mean(axis=1).tolist()
     assert entries(flown, "/tmc/metrics", "reward")[1:] == pytest.approx(mean, rel=1e-6, abs=1e-6)
 
 
-def test_events_of_scenario_1(case: tuple[Any, Flight, Referee]) -> None:
+def test_events_of_scenario_1(case: tuple[Any, EpisodeState, Referee]) -> None:
     flown, _, referee = case
     ticks, cells = entries(flown, "/tmc/events", "ticks"), entries(flown, "/tmc/events", "cells")
     assert list(zip(ticks, cells, strict=True)) == referee.events
     assert bool(referee.events) == (flown.world.config.scenario == 1)
 
 
-def test_blocked_moves_by_cause(case: tuple[Any, Flight, Referee]) -> None:
-    flown, flight, referee = case
+def test_blocked_moves_by_cause(case: tuple[Any, EpisodeState, Referee]) -> None:
+    flown, episode, referee = case
     counts = referee.blocked()
-    assert {block.name: n for block, n in flight.blocked.items()} == counts
-    assert all(counts.values()), "a flight without every kind of block shows little"
+    assert {block.name: n for block, n in episode.blocked.items()} == counts
+    assert all(counts.values()), "an episode without every kind of block shows little"
     assert flown.station.blocked == sum(counts.values())
 
 
-def test_no_two_uavs_share_a_cell(case: tuple[Any, Flight, Referee]) -> None:
+def test_no_two_uavs_share_a_cell(case: tuple[Any, EpisodeState, Referee]) -> None:
     """Eq. (1)."""
-    _, flight, _ = case
-    assert all(len(set(cells)) == N for cells in flight.cells.tolist())
+    _, episode, _ = case
+    assert all(len(set(cells)) == N for cells in episode.cells.tolist())
 
 
 @pytest.mark.parametrize("initial", ["visited", "random"])
@@ -217,7 +219,7 @@ def test_the_accounting_identity(mission: Callable[..., Any], toronto: RoadMap, 
     """sum_t u_k(t) = F_k - sum_v u_k(t_v before) (1 - q^(T - t_v + 1)) / (1 - q) over all cells (ADR 0006)."""
     T, N = 150, 4
     values = {"team.size": N, "training.ticks": T, "world.initial_map": initial, "world.rates": rates}
-    flown = mission({**values, "team.pilot": "planner:greedy"}, toronto).play(Random(1))
+    flown = mission({**values, "team.controller": "planner:greedy"}, toronto).play(Random(1))
     world, tracks = flown.world, flown.flown()
     visits: dict[int, list[int]] = {}
     for t in range(1, T + 1):
@@ -249,8 +251,8 @@ EXCHANGES: dict[str, dict[str, Any]] = {
 }
 
 
-def fresh(world: World) -> Flight:
-    return Flight(world, RewardLaw(world.config, world.law.q), Replay(world, Observer(world)), 1, 0)
+def fresh(world: World) -> EpisodeState:
+    return EpisodeState(world, RewardLaw(world.config, world.law.q), Replay(world, ObservationBuilder(world)), 1, 0)
 
 
 class Shipped:
@@ -262,7 +264,7 @@ class Shipped:
 
 @pytest.fixture(scope="module", params=list(EXCHANGES))
 def shipped(request: pytest.FixtureRequest, mission: Callable[..., Any], town: RoadMap) -> Shipped:
-    """Of a flight in a fixed order."""
+    """Of an episode in a fixed order."""
     flown = mission(EXCHANGES[request.param], town).play()
     return Shipped(flown.world, [[r for r in flown.records if r.uav == i] for i in range(4)])
 
@@ -278,27 +280,29 @@ def expected_map(world: World, queues: list[list[Record]], t: int) -> list[int]:
     return [newest.get(k, 0) for k in world.law.cells.tolist()]
 
 
-def deliver(world: World, queues: list[list[Record]], rng: Random) -> tuple[dict[int, Exchange], list[Truth], Flight]:
+def deliver(
+    world: World, queues: list[list[Record]], rng: Random
+) -> tuple[dict[int, Exchange], list[FinalTicks], EpisodeState]:
     """All records in some order that real UAVs could make: none ships before it is answered."""
-    flight, answers, truths = fresh(world), {}, []
+    episode, answers, truths = fresh(world), {}, []
     place, waiting = [0] * len(queues), [False] * len(queues)
-    while not flight.over:
+    while not episode.over:
         i = rng.choice([i for i, queue in enumerate(queues) if place[i] < len(queue) and not waiting[i]])
-        flight.accept(queues[i][place[i]])
+        episode.accept(queues[i][place[i]])
         place[i], waiting[i] = place[i] + 1, True
-        for exchange in flight.exchanges():
+        for exchange in episode.exchanges():
             answers[exchange.tick] = exchange
             for j in exchange.uavs:
                 waiting[j] = False
-        truths.append(flight.settle())
-    return answers, truths, flight
+        truths.append(episode.finalise())
+    return answers, truths, episode
 
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32))
 def test_answers_and_truth_do_not_depend_on_the_order_of_arrival(shipped: Shipped, seed: int) -> None:
     world, queues = shipped.world, shipped.queues
-    answers, truths, flight = deliver(world, queues, Random(seed))
+    answers, truths, episode = deliver(world, queues, Random(seed))
     first, truths_then, then = deliver(world, queues, Random(0))
     assert list(answers) == sorted(answers) == list(first)
     for t, answer in answers.items():
@@ -313,18 +317,18 @@ def test_answers_and_truth_do_not_depend_on_the_order_of_arrival(shipped: Shippe
     assert next(t.first for t in truths if t.uncertainty) == 0
     rows = np.repeat(np.arange(34), 4)
     uavs = np.tile(np.arange(4), 34)
-    assert flight.replay.belief(rows, uavs).tobytes() == then.replay.belief(rows, uavs).tobytes()
+    assert episode.replay.belief(rows, uavs).tobytes() == then.replay.belief(rows, uavs).tobytes()
 
 
 # What is refused.
 
 
-def changed(**fields: Any) -> Callable[[Record, Flight], Record]:
+def changed(**fields: Any) -> Callable[[Record, EpisodeState], Record]:
     return lambda r, _: dataclasses.replace(r, **fields)
 
 
-def put(name: str, place: int, value: int) -> Callable[[Record, Flight], Record]:
-    def make(r: Record, _: Flight) -> Record:
+def put(name: str, place: int, value: int) -> Callable[[Record, EpisodeState], Record]:
+    def make(r: Record, _: EpisodeState) -> Record:
         array = getattr(r, name).copy()
         array[place] = value
         return dataclasses.replace(r, **{name: array})
@@ -332,42 +336,42 @@ def put(name: str, place: int, value: int) -> Callable[[Record, Flight], Record]
     return make
 
 
-def cut(name: str) -> Callable[[Record, Flight], Record]:
+def cut(name: str) -> Callable[[Record, EpisodeState], Record]:
     return lambda r, _: dataclasses.replace(r, **{name: getattr(r, name)[:-1]})
 
 
-def longer(name: str) -> Callable[[Record, Flight], Record]:
+def longer(name: str) -> Callable[[Record, EpisodeState], Record]:
     return lambda r, _: dataclasses.replace(r, **{name: np.append(getattr(r, name), getattr(r, name)[-1:])})
 
 
-def seen(ticks: list[int], cells: list[int]) -> Callable[[Record, Flight], Record]:
+def seen(ticks: list[int], cells: list[int]) -> Callable[[Record, EpisodeState], Record]:
     return changed(seen_tick=np.array(ticks, "<u2"), seen_cell=np.array(cells, "<u2"))
 
 
-def stayed_unblocked(r: Record, flight: Flight) -> Record:
+def stayed_unblocked(r: Record, episode: EpisodeState) -> Record:
     """The action moves, nothing blocked it, and the UAV stands still."""
-    cell = flight.cells[r.first - 1, r.uav]
+    cell = episode.cells[r.first - 1, r.uav]
     cells = np.full(r.cells.size, cell, "<u2")
     return dataclasses.replace(
         r, cells=cells, actions=np.full(r.actions.size, 0, "u1"), blocks=np.zeros(r.blocks.size, "u1")
     )
 
 
-def moved_blocked(r: Record, flight: Flight) -> Record:
+def moved_blocked(r: Record, episode: EpisodeState) -> Record:
     """Every move is said to be blocked, but the cells change."""
-    assert len({int(flight.cells[r.first - 1, r.uav]), *r.cells.tolist()}) > 1
+    assert len({int(episode.cells[r.first - 1, r.uav]), *r.cells.tolist()}) > 1
     return dataclasses.replace(r, blocks=np.full(r.blocks.size, Block.UAV, "u1"))
 
 
-def claims(block: Block, action: Callable[[World, int], int]) -> Callable[[Record, Flight], Record]:
+def claims(block: Block, action: Callable[[World, int], int]) -> Callable[[Record, EpisodeState], Record]:
     """The UAV stays, and names a cause that its cell and its action rule out."""
 
-    def make(r: Record, flight: Flight) -> Record:
-        cell = int(flight.cells[r.first - 1, r.uav])
+    def make(r: Record, episode: EpisodeState) -> Record:
+        cell = int(episode.cells[r.first - 1, r.uav])
         size = r.actions.size
         return dataclasses.replace(
             r, cells=np.full(size, cell, "<u2"), blocks=np.full(size, block, "u1"),
-            actions=np.full(size, action(flight.world, cell), "u1"),
+            actions=np.full(size, action(episode.world, cell), "u1"),
         )  # fmt: skip
 
     return make
@@ -378,7 +382,7 @@ def free_move(world: World, cell: int) -> int:
     return next(a for a in range(8) if targets[a] >= 0 and not world.map.blocked[targets[a]])
 
 
-MALFORMED: dict[str, tuple[Callable[[Record, Flight], Record], str]] = {
+MALFORMED: dict[str, tuple[Callable[[Record, EpisodeState], Record], str]] = {
     "a gap before it": (changed(first=15), "starts at tick 15, expected 8"),
     "an overlap": (changed(first=7), "starts at tick 7, expected 8"),
     "from the start again": (changed(first=0), "starts at tick 0, expected 8"),
@@ -417,59 +421,59 @@ def halfway(mission: Callable[..., Any], town: RoadMap) -> tuple[World, list[lis
     return flown.world, [[r for r in flown.records if r.uav == i] for i in range(2)]
 
 
-def state(flight: Flight) -> bytes:
-    """Everything that a flight and its replay hold."""
-    own = {k: v for k, v in vars(flight).items() if k not in {"world", "reward", "replay"}}
-    memory = {k: v for k, v in vars(flight.replay).items() if k not in {"world", "observer"}}
+def state(episode: EpisodeState) -> bytes:
+    """Everything that an episode and its replay hold."""
+    own = {k: v for k, v in vars(episode).items() if k not in {"world", "reward", "replay"}}
+    memory = {k: v for k, v in vars(episode.replay).items() if k not in {"world", "observer"}}
     return pickle.dumps((own, {k: vars(v) if isinstance(v, Ring) else v for k, v in memory.items()}))
 
 
 @pytest.mark.parametrize("why", list(MALFORMED))
 def test_a_malformed_record_is_refused_and_changes_nothing(halfway: tuple[World, list[list[Record]]], why: str) -> None:
     world, queues = halfway
-    flight = fresh(world)
+    episode = fresh(world)
     for place in range(2):
         for queue in queues:
-            flight.accept(queue[place])
-            list(flight.exchanges())
-            flight.settle()
+            episode.accept(queue[place])
+            list(episode.exchanges())
+            episode.finalise()
     make, sentence = MALFORMED[why]
-    bad, before = make(queues[1][2], flight), state(flight)
+    bad, before = make(queues[1][2], episode), state(episode)
     with pytest.raises(RefusedError, match=sentence):
-        flight.accept(bad)
-    assert state(flight) == before
-    flight.accept(queues[1][2])  # the sound one is still welcome
-    assert flight.reported == [7, 14]
+        episode.accept(bad)
+    assert state(episode) == before
+    episode.accept(queues[1][2])  # the intact one is still welcome
+    assert episode.reported == [7, 14]
 
 
 def test_a_flight_starts_where_it_was_told_to(halfway: tuple[World, list[list[Record]]]) -> None:
     world, queues = halfway
-    flight, first = fresh(world), queues[0][0]
+    episode, first = fresh(world), queues[0][0]
     other = next(c for c in world.start_cells.tolist() if c != world.starts(1)[0])
-    before = state(flight)
+    before = state(episode)
     with pytest.raises(RefusedError, match=f"did not start on cell {world.starts(1)[0]}"):
-        flight.accept(dataclasses.replace(first, cells=np.array([other], "<u2")))
-    assert state(flight) == before
+        episode.accept(dataclasses.replace(first, cells=np.array([other], "<u2")))
+    assert state(episode) == before
 
 
 def test_nothing_follows_the_last_record(halfway: tuple[World, list[list[Record]]]) -> None:
     world, queues = halfway
-    flight = fresh(world)
+    episode = fresh(world)
     for place in range(5):
         for queue in queues:
-            flight.accept(queue[place])
-            list(flight.exchanges())
-    flight.settle()
-    assert flight.over and flight.done == 25
-    last, before = queues[0][-1], state(flight)
+            episode.accept(queue[place])
+            list(episode.exchanges())
+    episode.finalise()
+    assert episode.over and episode.done == 25
+    last, before = queues[0][-1], state(episode)
     for first, tick in ((22, 25), (26, 26), (26, 28)):
         size = tick - first + 1
         cells = np.full(size, last.cells[-1], "<u2")
         stay, none = np.full(size, 8, "u1"), np.zeros(size, "u1")
         with pytest.raises(RefusedError, match="UAV 0"):
-            flight.accept(
+            episode.accept(
                 dataclasses.replace(
                     last, first=first, tick=tick, cells=cells, actions=stay, blocks=none, rewards=np.zeros(size, "<f4")
                 )
             )
-    assert state(flight) == before
+    assert state(episode) == before

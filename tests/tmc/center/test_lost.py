@@ -1,4 +1,4 @@
-"""A UAV lost in flight: the others go on without it, its visits count up to its last record, and it is back later."""
+"""A UAV lost in episode: the others go on without it, its visits count up to its last record, and it is back later."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from actors.airspace import Waiting
-from actors.planners import Sight
+from actors.planners import LocalState
 from deploy.run.lockstep import LockStep
-from tmc.center.entries import Entry
-from tmc.center.episode import GONE
+from tmc.center.entries import JournalEntry
+from tmc.center.episode import NO_CELL
 from tmc.center.roster import Outbox, uav_name
 from tmc.kernel.config import build
 from tmc.kernel.world import World
@@ -26,15 +26,15 @@ class Losing:
     """A mission in one process in which UAV `LOST` dies at tick `dies` of episode 1 and says hello in episode 2."""
 
     def __init__(self, dies: int, **values: Any) -> None:
-        self.entries: list[Entry] = []
-        settings = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": T, "training.episodes": 3,
+        self.entries: list[JournalEntry] = []
+        settings = {"team.controller": "planner:greedy", "team.size": N, "training.ticks": T, "training.episodes": 3,
                     "comms.period": 7, "replay.learn_start": 1, "training.seed": 5}  # fmt: skip
         self.world = World(build(settings | values))
         self.dies = dies
         self.step = LockStep(self.world, None, self.keep)
         self.seen: dict[tuple[int, int, int], np.ndarray[Any, Any]] = {}
         for pilot in self.step.fleet.pilots:
-            pilot.decider = pilot._planner = Watching(self, pilot.uav, pilot._planner)
+            pilot.controller = pilot._planner = Watching(self, pilot.uav, pilot._planner)
 
     def keep(self, outbox: Outbox) -> None:
         self.entries += outbox.entries
@@ -54,10 +54,10 @@ class Losing:
             for pilot in fleet.pilots:
                 if pilot.uav == LOST and pilot.episode == 1 and pilot.t >= self.dies:
                     self.dead = True
-                    if self.step.station.flight is not None and self.step.station.flight.episode == 2:
+                    if self.step.station.episode is not None and self.step.station.episode.number == 2:
                         self.dead = False
                         self.deliver(self.step._exchange(LOST, m.Hello("uav", LOST, 2)))
-                        pilot.life, pilot.phase = 2, type(pilot.phase).IDLE
+                        pilot.incarnation, pilot.phase = 2, type(pilot.phase).IDLE
                         pilot.episode = 0
                     continue
                 before = (pilot.t, pilot.phase)
@@ -86,17 +86,17 @@ class Watching:
     def __init__(self, mission: Losing, uav: int, planner: Any) -> None:
         self.mission, self.uav, self.planner = mission, uav, planner
 
-    def choose(self, sight: Sight) -> int:
+    def choose(self, state: LocalState) -> int:
         episode = self.mission.step.fleet.pilots[self.uav].episode
-        image = self.mission.step.station.observer.observe(sight.cell, sight.peers, sight.u)
-        self.mission.seen[episode, sight.tick, self.uav] = image
-        return int(self.planner.choose(sight))
+        image = self.mission.step.station.observer.observe(state.cell, state.peers, state.u)
+        self.mission.seen[episode, state.tick, self.uav] = image
+        return int(self.planner.choose(state))
 
 
 @pytest.fixture(params=[(2, "together"), (2, "staggered"), (1, "together")], ids=lambda p: f"{p[0]}-{p[1]}")
 def losing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Losing]:
     """Pilots look up at every tick, so that the lost one was seen in places that its records do not tell of."""
-    monkeypatch.setattr("actors.pilot.STINT", 1)
+    monkeypatch.setattr("actors.pilot.MAX_TICKS_PER_ADVANCE", 1)
     scenario, phase = request.param
     return lambda dies: Losing(dies, **{"scenario": scenario, "comms.phase": phase}).fly()
 
@@ -116,7 +116,7 @@ def test_the_others_fly_on_and_the_truth_counts_its_records_only(losing: Callabl
         check_uncertainty(mission, cells)
 
 
-def tracks(entries: list[Entry]) -> dict[tuple[int, int, int], int]:
+def tracks(entries: list[JournalEntry]) -> dict[tuple[int, int, int], int]:
     """(episode, tick, uav): cell, from the journal."""
     records = [e.values["record"] for e in entries if "record" in e.values]
     return {(r.episode, t, r.uav): int(c) for r in records for t, c in enumerate(r.cells.tolist(), r.first)}
@@ -139,11 +139,11 @@ def check_uncertainty(mission: Losing, cells: dict[tuple[int, int, int], int]) -
 
 def test_by_priorities_nothing_of_a_lost_uav_is_drawn_either(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of what is left, everything is; planners tell no values, so all are as likely."""
-    monkeypatch.setattr("actors.pilot.STINT", 1)
-    mission = Losing(20, **{"scenario": 2, "comms.phase": "staggered", "replay.priority": 0.6}).fly()
+    monkeypatch.setattr("actors.pilot.MAX_TICKS_PER_ADVANCE", 1)
+    mission = Losing(20, **{"scenario": 2, "comms.phase": "staggered", "replay.priority_exponent": 0.6}).fly()
     replay = mission.step.station.replay
     place = np.arange(replay.starts_in)
-    there = {(p, i) for p, i in zip(*np.nonzero(replay.cells[replay.ends[place]] != GONE), strict=True)}
+    there = {(p, i) for p, i in zip(*np.nonzero(replay.cells[replay.ends[place]] != NO_CELL), strict=True)}
     drawn: set[tuple[int, int]] = set()
     for number in range(4):
         sample = replay.sample(number, 4000)
@@ -158,7 +158,7 @@ def test_what_is_learned_from_is_what_was_seen(losing: Callable[[int], Losing], 
     mission = losing(dies)
     replay = mission.step.station.replay
     sample = replay.sample(3, 4000)
-    assert (replay.cells[sample.row][np.arange(4000), sample.uav] != GONE).all()
+    assert (replay.cells[sample.row][np.arange(4000), sample.uav] != NO_CELL).all()
     episodes, ticks = replay.episode[sample.row].tolist(), replay.tick[sample.row].tolist()
     images = replay.observer.observe_batch(sample.views)
     for b, key in enumerate(zip(episodes, ticks, sample.uav.tolist(), strict=True)):
@@ -168,7 +168,7 @@ def test_what_is_learned_from_is_what_was_seen(losing: Callable[[int], Losing], 
 
 def flown_to(tick: int, **values: Any) -> LockStep:
     """A mission in one process, at that tick of its first episode."""
-    settings = {"team.pilot": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
+    settings = {"team.controller": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
     step = LockStep(World(build({**settings, "replay.learn_start": 1, **values})), None, lambda _: None)
     for i in range(N):
         for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
@@ -180,10 +180,10 @@ def flown_to(tick: int, **values: Any) -> LockStep:
 
 @pytest.mark.parametrize("priority", [0.0, 0.6])
 def test_nothing_is_drawn_of_ticks_in_which_nobody_is_left(priority: float) -> None:
-    step = flown_to(25, **{"replay.priority": priority})
+    step = flown_to(25, **{"replay.priority_exponent": priority})
     step.station.tick(1000.0)
-    assert all(member.life < 0 for member in step.station.roster)
-    step.station.settle()
+    assert all(member.incarnation < 0 for member in step.station.roster)
+    step.station.finalise()
     replay = step.station.replay
     assert replay.rows_in == 91
     sample = replay.sample(1, 2000)
@@ -196,7 +196,7 @@ def test_a_zombie_is_not_listened_to_and_is_back_with_the_next_episode() -> None
     for i in range(N):
         mission.step._exchange(i, m.Hello("uav", i, 1))
     station.tick(1000.0)
-    assert all(member.life < 0 for member in station.roster)
+    assert all(member.incarnation < 0 for member in station.roster)
     record = m.Record(0, 1, 0, 1, 0, 0, 0, 0, np.array([station.world.starts(1)[0]], "<u2"), *[np.zeros(0, "u1")] * 2,
                       np.zeros(0, "<f4"), m.EMPTY, m.EMPTY)  # fmt: skip
     station.out.take()
@@ -233,8 +233,8 @@ def test_a_full_memory_draws_nothing_that_is_written_over(
     monkeypatch: pytest.MonkeyPatch, phase: str, priority: float
 ) -> None:
     """Each number stands for one transition, and each transition is what was seen, before and after the loss."""
-    monkeypatch.setattr("actors.pilot.STINT", 1)
-    mission = Learning(20, **{"comms.phase": phase, "replay.priority": priority, "replay.capacity": 160}).fly()
+    monkeypatch.setattr("actors.pilot.MAX_TICKS_PER_ADVANCE", 1)
+    mission = Learning(20, **{"comms.phase": phase, "replay.priority_exponent": priority, "replay.capacity": 160}).fly()
     assert mission.draws > 50 and mission.wrong == []
     assert len(mission.step.station.replay) == 160
 
@@ -242,11 +242,11 @@ def test_a_full_memory_draws_nothing_that_is_written_over(
 def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
     """The whole team is lost for longer than the memory reaches back: the learner waits."""
     step = flown_to(35, **{"replay.capacity": 80, "training.episodes": 1})
-    replay, feed = step.station.replay, step.station.feed
-    step.station.limiter.ratio, feed.life = 1.0, 1
+    replay, feed = step.station.replay, step.station.sample_queue
+    step.station.rate_limiter.ratio, feed.incarnation = 1.0, 1
     assert len(replay) == 80 and feed.ask(m.SampleRequest(1)) is None
     step.station.tick(1000.0)
-    step.station.settle()
-    assert len(replay) == 0 and step.station.limiter.owed
+    step.station.finalise()
+    assert len(replay) == 0 and step.station.rate_limiter.samples_due
     assert list(feed.serve(0, 0)) == []
     assert step.station.phase == "done"  # nor does anybody wait for it

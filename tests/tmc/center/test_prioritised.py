@@ -1,4 +1,6 @@
-"""The replay memory with `replay.priority`: first priorities by the UAVs' own values, draws that follow, weights."""
+"""The replay memory with `replay.priority_exponent`: first priorities by the UAVs' own values, draws that follow,
+weights.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ from tmc.kernel.roadmap import RoadMap
 Nine = Callable[[int, int], list[float]]
 T, N, ALPHA, GAMMA, SCALE = 26, 3, 0.6, 0.9, 0.1
 VALUES: dict[str, Any] = {
-    "training.ticks": T, "training.episodes": 3, "team.size": N, "team.pilot": "policy", "comms.period": 7,
-    "replay.priority": ALPHA, "dqn.gamma": GAMMA, "dqn.reward_scale": SCALE, "replay.learn_start": 1,
+    "training.ticks": T, "training.episodes": 3, "team.size": N, "team.controller": "policy", "comms.period": 7,
+    "replay.priority_exponent": ALPHA, "dqn.gamma": GAMMA, "dqn.reward_scale": SCALE, "replay.learn_start": 1,
 }  # fmt: skip
 
 
@@ -112,8 +114,8 @@ def test_weights_make_up_for_it(filled: Replay) -> None:
 
 def test_without_priorities_a_record_has_no_values(mission: Callable[..., Any], town: RoadMap) -> None:
     """Nor has a planner's; and the draws are those of a replay that knows nothing of priorities."""
-    off = mission({**VALUES, "replay.priority": 0.0}, town).play()
-    planner = mission({**VALUES, "team.pilot": "planner:greedy"}, town).play()
+    off = mission({**VALUES, "replay.priority_exponent": 0.0}, town).play()
+    planner = mission({**VALUES, "team.controller": "planner:greedy"}, town).play()
     on = mission(VALUES, town).play()
     assert {r.values.size for r in off.records + planner.records} == {0}
     assert all(r.values.size == 2 * r.actions.size for r in on.records)
@@ -128,12 +130,12 @@ def test_a_record_with_other_values_than_moves_is_refused(
 ) -> None:
     flown = mission(VALUES, town)
     for what, _ in flown.steps():
-        flight = flown.station.flight
-        if what == "fly" and flown.up[0] and flight is not None and flight.done > 0:
+        episode = flown.station.episode
+        if what == "fly" and flown.up[0] and episode is not None and episode.done > 0:
             record = flown.up[0][-1]
             assert record.actions.size > 2
             with pytest.raises(RefusedError, match="values of 7 moves"):
-                flight.accept(dataclasses.replace(record, values=record.values[:size]))
+                episode.accept(dataclasses.replace(record, values=record.values[:size]))
             return
     pytest.fail("no record was seen")
 

@@ -1,4 +1,4 @@
-"""The limiter: neither side runs away from the other, and neither waits for ever."""
+"""The rate_limiter: neither side runs away from the other, and neither waits for ever."""
 
 from __future__ import annotations
 
@@ -8,55 +8,55 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tmc.center.rate_limiter import Limiter
+from tmc.center.rate_limiter import RateLimiter
 
 
 def test_nothing_is_owed_before_learning_starts() -> None:
-    limiter = Limiter(1.0, 10, 128)
-    limiter.insert(40, 120)
-    assert (limiter.owed, limiter.may_insert, limiter.origin) == (0, True, None)
-    limiter.insert(3, 129)
-    assert (limiter.owed, limiter.origin) == (0, 43)
-    limiter.insert(4, 141)
-    assert limiter.owed == 4
+    rate_limiter = RateLimiter(1.0, 10, 128)
+    rate_limiter.insert(40, 120)
+    assert (rate_limiter.samples_due, rate_limiter.can_insert, rate_limiter.origin) == (0, True, None)
+    rate_limiter.insert(3, 129)
+    assert (rate_limiter.samples_due, rate_limiter.origin) == (0, 43)
+    rate_limiter.insert(4, 141)
+    assert rate_limiter.samples_due == 4
 
 
 def test_one_minibatch_a_tick_as_in_algorithm_1() -> None:
-    limiter = Limiter(1.0, 200, 1)
-    limiter.insert(1, 3)
+    rate_limiter = RateLimiter(1.0, 200, 1)
+    rate_limiter.insert(1, 3)
     for tick in range(1, 50):
-        limiter.insert(1, 3 * tick)
-        assert limiter.owed == 1
-        limiter.sample()
-        assert limiter.owed == 0 and limiter.updates == tick
+        rate_limiter.insert(1, 3 * tick)
+        assert rate_limiter.samples_due == 1
+        rate_limiter.sample()
+        assert rate_limiter.samples_due == 0 and rate_limiter.updates == tick
 
 
 @pytest.mark.parametrize(("ratio", "slack"), [(1.0, 5), (0.25, 8), (4.0, 2), (0.01, 1)])
 def test_inserts_are_held_back_beyond_the_slack_and_no_sooner(ratio: float, slack: int) -> None:
-    limiter = Limiter(ratio, slack, 1)
-    limiter.insert(1, 1)
+    rate_limiter = RateLimiter(ratio, slack, 1)
+    rate_limiter.insert(1, 1)
     for ahead in range(1, 300):
-        limiter.insert(1, 1)
-        assert limiter.owed == int(ahead * ratio + 1e-9)
-        assert limiter.may_insert == (limiter.owed <= slack * ratio)
-    assert not limiter.may_insert
-    while not limiter.may_insert:
-        limiter.sample()
-    assert limiter.owed == int(slack * ratio)
+        rate_limiter.insert(1, 1)
+        assert rate_limiter.samples_due == int(ahead * ratio + 1e-9)
+        assert rate_limiter.can_insert == (rate_limiter.samples_due <= slack * ratio)
+    assert not rate_limiter.can_insert
+    while not rate_limiter.can_insert:
+        rate_limiter.sample()
+    assert rate_limiter.samples_due == int(slack * ratio)
 
 
 def test_a_minibatch_that_is_not_owed_is_refused() -> None:
-    limiter = Limiter(1.0, 5, 1)
-    before = copy.copy(limiter)
+    rate_limiter = RateLimiter(1.0, 5, 1)
+    before = copy.copy(rate_limiter)
     with pytest.raises(ValueError, match="no minibatch is owed"):
-        limiter.sample()
-    assert limiter == before
+        rate_limiter.sample()
+    assert rate_limiter == before
 
 
 def test_without_a_learner_nothing_is_sampled_and_nothing_held_back() -> None:
-    limiter = Limiter(0.0, 1, 1)
-    limiter.insert(1_000_000, 1_000_000)
-    assert limiter.owed == 0 and limiter.may_insert
+    rate_limiter = RateLimiter(0.0, 1, 1)
+    rate_limiter.insert(1_000_000, 1_000_000)
+    assert rate_limiter.samples_due == 0 and rate_limiter.can_insert
 
 
 @given(
@@ -67,18 +67,18 @@ def test_the_two_sides_stay_together_whatever_they_do(
     ratio: float, slack: int, learn_start: int, what: list[tuple[bool, int]]
 ) -> None:
     """Samples never exceed what is owed; whenever one side is held back the other may go on."""
-    limiter, transitions, largest = Limiter(ratio, slack, learn_start), 0, 0
+    rate_limiter, transitions, largest = RateLimiter(ratio, slack, learn_start), 0, 0
     for insert, ticks in what:
-        if insert and limiter.may_insert:
+        if insert and rate_limiter.can_insert:
             transitions, largest = transitions + ticks, max(largest, ticks)
-            limiter.insert(ticks, transitions)
-        elif not insert and limiter.owed:
-            limiter.sample()
-        assert limiter.may_insert or limiter.owed > 0
-        if limiter.origin is None:
-            assert transitions < learn_start and limiter.updates == 0
+            rate_limiter.insert(ticks, transitions)
+        elif not insert and rate_limiter.samples_due:
+            rate_limiter.sample()
+        assert rate_limiter.can_insert or rate_limiter.samples_due > 0
+        if rate_limiter.origin is None:
+            assert transitions < learn_start and rate_limiter.updates == 0
             continue
-        since = limiter.ticks - limiter.origin
-        assert limiter.updates <= since * ratio
-        assert limiter.owed == int(since * ratio) - limiter.updates
-        assert limiter.owed <= slack * ratio + largest * ratio + 1
+        since = rate_limiter.ticks - rate_limiter.origin
+        assert rate_limiter.updates <= since * ratio
+        assert rate_limiter.samples_due == int(since * ratio) - rate_limiter.updates
+        assert rate_limiter.samples_due <= slack * ratio + largest * ratio + 1

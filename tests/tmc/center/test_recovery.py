@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from tmc.__main__ import run_of
 from tmc.analysis.invariants.check import check
 from tmc.center import recovery
-from tmc.center.entries import Entry
+from tmc.center.entries import JournalEntry
 from tmc.center.journal import Journal, policy_path
 from tmc.center.roster import LEARNER, Outbox, uav_name
 from tmc.center.service import binds
@@ -30,7 +30,7 @@ from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 from tmc.record import builders
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import seal_run
+from tmc.record.mcap.compact import compact_run
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
@@ -53,7 +53,7 @@ class Case:
     seed: int
 
     def station(self, world: World) -> Station:
-        fixed = b"policy" if world.config.team.pilot == "policy" and not self.learning else None
+        fixed = b"policy" if world.config.team.controller == "policy" and not self.learning else None
         return Station(world, "run", learning=self.learning, policy=fixed)
 
 
@@ -66,7 +66,7 @@ def cases(draw: st.DrawFn) -> Case:
     values = {
         "scenario": draw(st.sampled_from([1, 2, 2])),
         "team.size": size,
-        "team.pilot": draw(st.sampled_from(pilots)),
+        "team.controller": draw(st.sampled_from(pilots)),
         "comms.period": draw(st.integers(1, 10)),
         "comms.phase": draw(st.sampled_from(["together", "staggered"])),
         "world.initial_map": draw(st.sampled_from(["visited", "random"])),
@@ -74,11 +74,11 @@ def cases(draw: st.DrawFn) -> Case:
         "training.episodes": draw(st.integers(1, 5)),
         "training.seed": draw(st.integers(0, 99)),
         "dqn.n_step": draw(st.sampled_from([1, 3])),
-        "dqn.batch": 4,
+        "dqn.batch_size": 4,
         "replay.capacity": size * draw(st.sampled_from([1, ticks, 2 * ticks + 1, 1000])),
         "replay.learn_start": size,
-        "replay.slack": draw(st.sampled_from([1, 4])),
-        "replay.priority": draw(st.sampled_from([0.0, 0.0, 0.6])),
+        "replay.error_buffer": draw(st.sampled_from([1, 4])),
+        "replay.priority_exponent": draw(st.sampled_from([0.0, 0.0, 0.6])),
     }
     loses = draw(st.sampled_from([0, 0, 1]))
     return Case(values, learning, draw(st.sampled_from([0.0, 0.02])), loses, draw(st.integers(0, 2**16)))
@@ -92,7 +92,7 @@ class Learner:
     updates: int = 0
     version: int = 0
     open: int = 0
-    life: int = 1
+    incarnation: int = 1
 
     def join(self) -> None:
         self.open = 0
@@ -100,7 +100,7 @@ class Learner:
         self.push()
 
     def hello(self) -> m.Hello:
-        return m.Hello("learner", -1, self.life, self.updates)
+        return m.Hello("learner", -1, self.incarnation, self.updates)
 
     def push(self) -> None:
         self.version = max(self.version, self.flown.station.policies.newest) + 1
@@ -120,22 +120,22 @@ class Learner:
 
 
 @dataclass
-class Flown:
+class RunData:
     """A mission that was flown; `heard[k]` was told when `before[k]` entries had been made."""
 
     case: Case
     world: World
     heard: list[tuple[str, m.Message | None]]
     before: list[int]
-    entries: list[Entry]
+    entries: list[JournalEntry]
     updates: list[int] = field(default_factory=list)
 
 
-def fly(mission: Callable[..., Any], town: RoadMap, case: Case) -> Flown:
+def fly(mission: Callable[..., Any], town: RoadMap, case: Case) -> RunData:
     """Fly a mission; `loses` UAVs are given up at some time, and their next processes wait for the next episode."""
     flown = mission(case.values, town, learning=case.learning)
     rng, learner = Random(case.seed), Learner(flown)
-    noted = Flown(case, flown.world, [], [], flown.entries)
+    noted = RunData(case, flown.world, [], [], flown.entries)
     tell = flown.tell
 
     def noting(sender: str, message: m.Message) -> Any:
@@ -149,10 +149,10 @@ def fly(mission: Callable[..., Any], town: RoadMap, case: Case) -> Flown:
         flown.silence = lambda: (learner.work(), silence())
     to_lose = case.loses
     for _ in flown.steps(rng, case.crash):
-        flight = flown.station.flight
+        episode = flown.station.episode
         if case.learning and rng.random() < 0.3:
             learner.work()
-        if to_lose and flight is not None and flown.N > 1 and rng.random() < 0.03:
+        if to_lose and episode is not None and flown.N > 1 and rng.random() < 0.03:
             to_lose -= 1
             i = rng.randrange(flown.N)
             flown.lose(i, on_the_air=False)
@@ -162,7 +162,7 @@ def fly(mission: Callable[..., Any], town: RoadMap, case: Case) -> Flown:
     return noted
 
 
-def note(noted: Flown, flown: Any, sender: str, message: m.Message | None, learner: Learner) -> None:
+def note(noted: RunData, flown: Any, sender: str, message: m.Message | None, learner: Learner) -> None:
     noted.heard.append((sender, message))
     noted.before.append(len(flown.entries))
     noted.updates.append(learner.updates)
@@ -170,14 +170,14 @@ def note(noted: Flown, flown: Any, sender: str, message: m.Message | None, learn
 
 def give_up(station: Station, i: int) -> None:
     """As `Station.tick` does after a long silence."""
-    flight = station.flight
-    assert flight is not None
-    station.lose(flight, i)
-    station.early.accept(station, flight)
-    station.settle()
+    episode = station.episode
+    assert episode is not None
+    station.lose(episode, i)
+    station.reorder_buffer.accept(station, episode)
+    station.finalise()
 
 
-def told(station: Station, sender: str, message: m.Message | None) -> list[Entry]:
+def told(station: Station, sender: str, message: m.Message | None) -> list[JournalEntry]:
     """Tell a station what another one heard; returns its entries."""
     if message is None:
         give_up(station, int(sender[4:]))
@@ -187,7 +187,7 @@ def told(station: Station, sender: str, message: m.Message | None) -> list[Entry
     return station.out.take().entries
 
 
-def journalled(folder: Path, world: World, entries: list[Entry], models: bool = True) -> Path:
+def journalled(folder: Path, world: World, entries: list[JournalEntry], models: bool = True) -> Path:
     """A journal of these entries, with the policy files beside it."""
     folder.mkdir()
     journal = Journal(folder, world, "run")
@@ -199,37 +199,40 @@ def journalled(folder: Path, world: World, entries: list[Entry], models: bool = 
     return folder / "tmc.mcap"
 
 
-def recovered(case: Case, world: World, path: Path) -> tuple[Station, list[Entry]]:
+def recovered(case: Case, world: World, path: Path) -> tuple[Station, list[JournalEntry]]:
     station = case.station(world)
     return station, recovery.recover(station, path, 1.0)
 
 
 def state(station: Station) -> dict[str, Any]:
-    """All that must be the same; of lives and of the learner's progress a journal knows less than the TMC did."""
+    """All that must be the same; a journal knows less of incarnations and of the learner than the TMC did."""
     names = ("episodes", "version", "ticks", "steps", "blocked", "blocked_by_uav", "loss", "uncertainty",
              "episode_uncertainty", "phase")  # fmt: skip
     found: dict[str, Any] = {name: getattr(station, name) for name in names if name != "phase"}
-    found |= {"limiter": (station.limiter.ticks, station.limiter.origin), "policy": station.policies.newest}
+    found |= {
+        "rate_limiter": (station.rate_limiter.ticks, station.rate_limiter.origin),
+        "policy": station.policies.newest,
+    }
     found |= {"sequence": [member.sequence for member in station.roster]}
     found |= {"replay": station.replay.digest(), "transitions": len(station.replay)}
-    if station.flight is not None:
-        f = station.flight
-        names = ("episode", "reported", "lost", "next_exchange", "done", "version", "total_uncertainty",
+    if station.episode is not None:
+        f = station.episode
+        names = ("number", "reported", "lost", "next_exchange", "done", "version", "total_uncertainty",
                  "total_reward", "blocked", "visited", "visited_by_team", "starts")  # fmt: skip
-        found |= {f"flight.{name}": getattr(f, name) for name in names}
-        found["flight.maps"] = f.digest()
+        found |= {f"episode.{name}": getattr(f, name) for name in names}
+        found["episode.maps"] = f.digest()
         arrays = (f.cells, f.actions, f.blocks, f.own_rewards, f.rewards)
-        found["flight.arrays"] = [a.tobytes() for a in arrays]
+        found["episode.arrays"] = [a.tobytes() for a in arrays]
     return found
 
 
-def plain(entries: list[Entry], learning: bool) -> list[tuple[str, dict[str, Any]]]:
+def plain(entries: list[JournalEntry], learning: bool) -> list[tuple[str, dict[str, Any]]]:
     """Entries that can be compared; how far the learner was, and which policy was the last, depend on its asking."""
     drop = {"updates", "model"} if learning else set()
     return [(e.topic, {k: repr(v) for k, v in e.values.items() if k not in drop}) for e in entries]
 
 
-def from_outside(entry: Entry) -> bool:
+def from_outside(entry: JournalEntry) -> bool:
     """An entry that does not follow from those before it: a kill may have made it not happen."""
     return entry.topic == "/tmc/lost" or (entry.topic == "/tmc/episode" and entry.values["phase"] == "begin")
 
@@ -266,18 +269,18 @@ def test_a_journal_cut_anywhere_gives_the_state_and_goes_on(
 
 def greet(station: Station, reference: Station, updates: int) -> None:
     """Everybody who was there says hello again."""
-    if reference.learning and reference.feed.life >= 0:
+    if reference.learning and reference.sample_queue.incarnation >= 0:
         station.handle(LEARNER, m.Hello("learner", -1, 1, updates), 1.0)
     for i, member in enumerate(reference.roster):
-        if member.life >= 0:
-            station.handle(uav_name(i), m.Hello("uav", i, member.life), 1.0)
+        if member.incarnation >= 0:
+            station.handle(uav_name(i), m.Hello("uav", i, member.incarnation), 1.0)
 
 
-# Killed in flight.
+# Killed in episode.
 
 
 REFLOWN = Case(
-    {"team.size": 2, "team.pilot": "policy", "training.ticks": 3, "training.episodes": 5, "training.seed": 73,
+    {"team.size": 2, "team.controller": "policy", "training.ticks": 3, "training.episodes": 5, "training.seed": 73,
      "comms.period": 1, "comms.phase": "staggered"},
     learning=False, crash=0.02, loses=0, seed=0,
 )  # fmt: skip
@@ -313,7 +316,7 @@ def test_a_tmc_killed_in_flight_flies_the_same(
     assert len(record) == len(rough.records) == len(calm.records)
 
 
-def told_by(entries: list[Entry]) -> list[Any]:
+def told_by(entries: list[JournalEntry]) -> list[Any]:
     """What a mission's journal tells, however its truth was cut into messages: the digests at the ends included."""
     alike = ("/tmc/sync", "/tmc/state", "/tmc/episode", "/tmc/last_visit")
     found: list[Any] = [plain([e for e in entries if e.topic == topic], True) for topic in alike]
@@ -325,9 +328,9 @@ def told_by(entries: list[Entry]) -> list[Any]:
 
 
 LONG = Case(
-    {"team.size": 3, "team.pilot": "policy", "training.ticks": 20, "training.episodes": 9, "comms.period": 4,
+    {"team.size": 3, "team.controller": "policy", "training.ticks": 20, "training.episodes": 9, "comms.period": 4,
      "comms.phase": "staggered", "world.initial_map": "random", "replay.capacity": 130, "replay.learn_start": 70,
-     "replay.slack": 4, "dqn.batch": 4},
+     "replay.error_buffer": 4, "dqn.batch_size": 4},
     learning=True, crash=0.01, loses=0, seed=3,
 )  # fmt: skip
 
@@ -347,8 +350,10 @@ def test_of_old_episodes_only_the_sums_are_taken(
     missing = recovery.play(whole, log.raw(), path.parent, 1.0)
     assert plain(recovery.play(quick, log.raw(), path.parent, 1.0, skip), False) == plain(missing, False)
     assert state(quick) == state(whole)
-    assert [(u.life, u.sequence, u.past) for u in quick.roster] == [(u.life, u.sequence, u.past) for u in whole.roster]
-    assert quick.limiter == whole.limiter
+    assert [(u.incarnation, u.sequence, u.former) for u in quick.roster] == [
+        (u.incarnation, u.sequence, u.former) for u in whole.roster
+    ]
+    assert quick.rate_limiter == whole.rate_limiter
     first, second = whole.replay.sample(5, 64), quick.replay.sample(5, 64)
     assert first.views.u.tobytes() == second.views.u.tobytes()
     assert first.reward.tobytes() == second.reward.tobytes()
@@ -363,18 +368,18 @@ def flown(mission: Callable[..., Any], town: RoadMap) -> Any:
     return mission({"team.size": 2, "training.ticks": 12, "training.episodes": 2, "comms.period": 4}, town).play()
 
 
-def at(entries: list[Entry], topic: str, number: int) -> int:
+def at(entries: list[JournalEntry], topic: str, number: int) -> int:
     return [n for n, e in enumerate(entries) if e.topic == topic][number]
 
 
-def later_record(entries: list[Entry], **changes: Any) -> list[Entry]:
+def later_record(entries: list[JournalEntry], **changes: Any) -> list[JournalEntry]:
     """The third record of UAV 0 altered."""
     n = at(entries, "/uav/0/record", 2)
     record = replace(entries[n].values["record"], **changes)
-    return [*entries[:n], Entry("/uav/0/record", {"record": record}), *entries[n + 1 :]]
+    return [*entries[:n], JournalEntry("/uav/0/record", {"record": record}), *entries[n + 1 :]]
 
 
-CONTRADICTIONS: dict[str, tuple[Callable[[list[Entry]], list[Entry]], str]] = {
+CONTRADICTIONS: dict[str, tuple[Callable[[list[JournalEntry]], list[JournalEntry]], str]] = {
     "a record is missing": (
         lambda es: [e for n, e in enumerate(es) if n != at(es, "/uav/1/record", 1)],
         "has record 2 of UAV 1 out of turn",
@@ -446,7 +451,7 @@ def test_policy_files(mission: Callable[..., Any], town: RoadMap, tmp_path: Path
 def test_a_journal_that_goes_on_leaves_only_the_policies_that_are_held(
     flown: Any, tmp_path: Path, durability: str
 ) -> None:
-    """Those of an earlier life too, and each as it is held now, whatever stands in the file of that name."""
+    """Those of an earlier incarnation too, and each as it is held now, whatever stands in the file of that name."""
     journalled(tmp_path / "run", flown.world, flown.entries[:3])
     for name in ("policy-3.onnx", "policy-7.onnx", "final.onnx"):
         (tmp_path / "run" / "policies").mkdir(exist_ok=True)
@@ -460,15 +465,17 @@ def test_a_journal_that_goes_on_leaves_only_the_policies_that_are_held(
 
 
 def test_a_process_that_has_flown_nothing_yet_is_missed_too(flown: Any, tmp_path: Path) -> None:
-    """Its life is in no record: it is given up after the same silence as the others, and not waited for for ever."""
+    """Its incarnation is in no record: it is given up after the same silence as the others, and not waited for for
+    ever.
+    """
     path = journalled(tmp_path / "run", flown.world, flown.entries[: at(flown.entries, "/tmc/episode", 0) + 1])
     station = Station(flown.world, "run", learning=False, policy=b"policy")
     recovery.recover(station, path, 100.0)
     station.handle("uav-000", m.Hello("uav", 0, 5), 150.0)
     station.tick(159.0)
-    assert station.flight is not None and station.flight.lost == {}
+    assert station.episode is not None and station.episode.lost == {}
     station.tick(161.0)
-    assert station.flight.lost == {1: -1}
+    assert station.episode.lost == {1: -1}
 
 
 def test_who_missed_that_an_episode_began_is_told_again(flown: Any, tmp_path: Path) -> None:
@@ -476,7 +483,7 @@ def test_who_missed_that_an_episode_began_is_told_again(flown: Any, tmp_path: Pa
     path = journalled(tmp_path / "run", flown.world, flown.entries[: at(flown.entries, "/tmc/episode", 2) + 1])
     station = Station(flown.world, "run", learning=False, policy=b"policy")
     recovery.recover(station, path, 1.0)
-    assert station.flight is not None and station.flight.episode == 2
+    assert station.episode is not None and station.episode.number == 2
     record = [r for r in flown.records if (r.uav, r.episode) == (1, 1)][-1]
     station.handle("uav-001", record, 1.0)
     (answer,) = [x for _, x in station.out.take().sends]
@@ -513,7 +520,7 @@ def test_map_and_replay_from_a_sealed_log_alone_are_those_of_the_tmc(
     flown = mission({"scenario": scenario, "team.size": 3, "training.ticks": 60, "training.episodes": 3,
                      "comms.phase": "staggered", "replay.capacity": 300}).play(Random(1))  # fmt: skip
     path = journalled(tmp_path / "run", flown.world, flown.entries)
-    seal_run(path.parent)
+    compact_run(path.parent)
     result = check(path.parent)
     assert result.good and next(row.facts for row in result.rows if row.name == "state") == 9
     told = [e.message for e in Log(path).entries(["/tmc/state"])]
@@ -521,6 +528,6 @@ def test_map_and_replay_from_a_sealed_log_alone_are_those_of_the_tmc(
     for name, what in (("map", "the maps are others"), ("replay", "the replay memory is another")):
         entries = list(flown.entries)
         n = at(entries, "/tmc/state", 1)
-        entries[n] = Entry("/tmc/state", entries[n].values | {name: told[0].map})
+        entries[n] = JournalEntry("/tmc/state", entries[n].values | {name: told[0].map})
         row = check(journalled(tmp_path / name, flown.world, entries).parent).rows[-1]
         assert row.name == "state" and str(row.violation) == f"episode 2: {what}"

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tmc.center.reorder_buffer import MOST
+from tmc.center.reorder_buffer import MAX_BUFFERED_RECORDS
 from tmc.center.roster import uav_name
 from tmc.center.station import Station
 from tmc.kernel.config import build
@@ -16,7 +16,7 @@ from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 from tmc.wire import messages as m
 
-VALUES = {"team.size": 3, "training.ticks": 40, "comms.period": 5, "team.pilot": "planner:greedy"}
+VALUES = {"team.size": 3, "training.ticks": 40, "comms.period": 5, "team.controller": "planner:greedy"}
 
 
 @pytest.fixture(params=["together", "staggered"])
@@ -25,11 +25,11 @@ def flown(request: pytest.FixtureRequest, mission: Callable[..., Any], town: Roa
     return mission({**VALUES, "comms.phase": request.param}, town).play()
 
 
-def started_again(flown: Any, life: int = 1) -> Station:
+def started_again(flown: Any, incarnation: int = 1) -> Station:
     """A station that knows nothing yet of what was flown."""
     station = Station(flown.world, "run", learning=False)
     for i in range(flown.N):
-        station.handle(uav_name(i), m.Hello("uav", i, life), 1.0)
+        station.handle(uav_name(i), m.Hello("uav", i, incarnation), 1.0)
     station.out.take()
     return station
 
@@ -44,7 +44,7 @@ def told(station: Station, records: list[m.Record]) -> list[Any]:
 
 
 def test_records_of_one_uav_after_the_other_are_taken_in_their_turn(flown: Any) -> None:
-    """Each UAV says all of its flight at once, as after a long time without a commit."""
+    """Each UAV says all of its episode at once, as after a long time without a commit."""
     station = started_again(flown)
     entries = told(station, sorted(flown.records, key=lambda r: r.uav))
     assert station.phase == "done"
@@ -67,10 +67,10 @@ def test_a_new_process_is_not_answered_by_what_the_old_one_said_early(flown: Any
     station = started_again(flown)
     mine = [r for r in flown.records if r.uav == 0]
     told(station, mine[:3])
-    assert station.early.count(0) == 3 - station.roster[0].sequence > 0
+    assert station.reorder_buffer.count(0) == 3 - station.roster[0].sequence > 0
     station.handle("uav-000", m.Hello("uav", 0, 2), 3.0)
-    assert station.early.count(0) == 0
-    again = [replace(r, life=2) for r in mine[station.roster[0].sequence :]]
+    assert station.reorder_buffer.count(0) == 0
+    again = [replace(r, incarnation=2) for r in mine[station.roster[0].sequence :]]
     others = [r for r in flown.records if r.uav != 0]
     station.out.take()
     told(station, [*again, *others])
@@ -81,16 +81,16 @@ def test_a_repeat_of_an_early_record_is_dropped_in_silence(flown: Any) -> None:
     station = started_again(flown)
     mine = [r for r in flown.records if r.uav == 1][:3]
     told(station, mine)
-    assert told(station, mine[1:]) == [] and station.early.count(1) == 2 and not station.rejected
+    assert told(station, mine[1:]) == [] and station.reorder_buffer.count(1) == 2 and not station.rejected
 
 
 def test_early_records_have_an_end(flown: Any) -> None:
     station = started_again(flown)
     mine = [r for r in flown.records if r.uav == 1]
     told(station, mine[:2])
-    for k in range(2, MOST + 10):
+    for k in range(2, MAX_BUFFERED_RECORDS + 10):
         station.handle("uav-001", replace(mine[1], sequence=k), 2.0)
-    assert station.early.count(1) == MOST
+    assert station.reorder_buffer.count(1) == MAX_BUFFERED_RECORDS
 
 
 def alive(station: Station, **more: int) -> list[m.Message]:
@@ -100,7 +100,7 @@ def alive(station: Station, **more: int) -> list[m.Message]:
 
 
 def test_a_uav_that_waits_with_records_that_the_tmc_misses_is_told_to_say_hello(flown: Any) -> None:
-    """It has its answer of an earlier life of the TMC and flies on; without its record no exchange can be held."""
+    """It has its answer of an earlier incarnation of the TMC; without its record no exchange can be held."""
     station = started_again(flown)
     mine = [r for r in flown.records if r.uav == 0]
     (error,) = alive(station, sequence=1)
@@ -111,24 +111,24 @@ def test_a_uav_that_waits_with_records_that_the_tmc_misses_is_told_to_say_hello(
 
 
 def test_a_process_that_said_hello_to_an_earlier_life_of_the_tmc_is_not_fenced(flown: Any) -> None:
-    """The journal knows the processes that have shipped a record; a newer one may be on its first flight."""
+    """The journal knows the processes that have shipped a record; a newer one may be on its first episode."""
     station = started_again(flown)
     mine = next(r for r in flown.records if r.uav == 0)
-    assert [x.code for x in alive(station, life=7) if isinstance(x, m.Error)] == ["state"]
-    station.handle("uav-000", replace(mine, life=7), 2.0)
+    assert [x.code for x in alive(station, incarnation=7) if isinstance(x, m.Error)] == ["state"]
+    station.handle("uav-000", replace(mine, incarnation=7), 2.0)
     (error,) = (x for _, x in station.out.take().sends)
     assert isinstance(error, m.Error) and error.code == "state"
     station.handle("uav-000", m.Hello("uav", 0, 7), 2.0)
     station.out.take()
-    told(station, [replace(mine, life=7)])
-    station.handle("uav-000", replace(mine, life=1), 2.0)
+    told(station, [replace(mine, incarnation=7)])
+    station.handle("uav-000", replace(mine, incarnation=1), 2.0)
     assert [x.code for _, x in station.out.take().sends if isinstance(x, m.Error)] == ["fenced"]
-    assert alive(station, life=1, sequence=9) == []
+    assert alive(station, incarnation=1, sequence=9) == []
 
 
 def test_the_next_process_flies_the_policy_of_the_last_one(town: RoadMap) -> None:
     """Peers may have seen what the last one flew by it, so a newer policy has to wait for the next exchange."""
-    config = build({**VALUES, "team.pilot": "policy", "team.size": 1})
+    config = build({**VALUES, "team.controller": "policy", "team.size": 1})
     station = Station(World(config, town), "run", learning=True)
     station.handle("learner", m.Hello("learner", -1, 5), 1.0)
     station.handle("learner", m.PolicyPush(1, 0, 0.0, b"one"), 1.0)

@@ -1,4 +1,4 @@
-"""The replay memory rebuilds from flight records what the UAVs saw, bit for bit, and keeps and draws what it should."""
+"""The replay memory rebuilds what the UAVs saw from flight records, bit for bit, and keeps and draws what it should."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 
 from tmc.center.replay import Replay
 from tmc.kernel.config import build
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.roadmap import RoadMap
 from tmc.kernel.world import World
 
@@ -56,7 +56,7 @@ def test_observations_of_flights_with_lost_processes(mission: Callable[..., Any]
     """A UAV that was lost and came back saw what it would have seen, and the replay rebuilds that."""
     values = {"team.size": 4, "comms.phase": "staggered", "comms.period": 7, "training.ticks": 80}
     flown = mission(values, town).play(Random(3), crash=0.03)
-    assert max(flown.lives) > 1
+    assert max(flown.incarnations) > 1
     assert flown.differences(list(flown.seen)) == []
 
 
@@ -148,7 +148,10 @@ def test_a_full_memory_keeps_the_newest_and_every_live_map(
 
 def test_the_memory_grows_with_its_capacity_and_not_with_the_mission(town: RoadMap) -> None:
     short, long = (
-        Replay(World(build({"training.episodes": e, "replay.capacity": 3000}), town), Observer(World(build({}), town)))
+        Replay(
+            World(build({"training.episodes": e, "replay.capacity": 3000}), town),
+            ObservationBuilder(World(build({}), town)),
+        )
         for e in (1, 1_000_000)
     )
     assert short.cells.data.shape == long.cells.data.shape
@@ -232,7 +235,7 @@ def test_a_capacity_below_the_team_is_not_exceeded_in_silence(town: RoadMap) -> 
         world = World(build({"team.size": 5, "replay.capacity": 3, "replay.learn_start": 1}), town)
     except ValueError:
         return
-    replay = Replay(world, Observer(world))
+    replay = Replay(world, ObservationBuilder(world))
     for t in range(4):
         zeros = np.zeros((1, 5))
         arrays = (zeros.astype("u2"), zeros.astype("u1"), zeros.astype("f4"), zeros.astype(np.int64))

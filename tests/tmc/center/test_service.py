@@ -1,4 +1,4 @@
-"""The TMC's process, killed before a group commit: what it told UAVs for good, its next life knows too."""
+"""The TMC's process, killed before a group commit: what it told UAVs for good, its next incarnation knows too."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ import pytest
 import zmq
 
 from actors.pilot import Pilot
-from actors.planners import Sight
+from actors.planners import LocalState
 from actors.tracks import TableTracks, TrackTable
 from tmc.center.journal import journal_in
 from tmc.center.recovery import recover
 from tmc.center.roster import LEARNER
-from tmc.center.service import LEAD
+from tmc.center.service import MAX_TICKS_UNCOMMITTED
 from tmc.center.station import Station
 from tmc.kernel.config import build, flat
 from tmc.kernel.grid import N_ACTIONS
-from tmc.kernel.observation import Observer
+from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.record.reader import Log
 from tmc.wire import messages as m
 from tmc.wire import sockets
 
 ROOT = Path(__file__).parents[3]
-PATIENCE = 100_000
+PATIENCE_MS = 100_000
 """Milliseconds in which the TMC must answer."""
 # Nothing is committed or flushed for its age while a test lasts.
 VALUES = {
-    "team.size": 1, "training.ticks": 3 * LEAD, "training.episodes": 1, "comms.period": 10,
-    "journal.commit": 60.0, "journal.flush": 60.0,
+    "team.size": 1, "training.ticks": 3 * MAX_TICKS_UNCOMMITTED, "training.episodes": 1, "comms.period": 10,
+    "journal.commit_interval": 60.0, "journal.flush_interval": 60.0,
 }  # fmt: skip
 
 Said = TypeVar("Said", bound=m.Message)
@@ -60,7 +60,7 @@ class Client:
             sockets.send(self.sock, message)
 
     def hear(self, kind: type[Said]) -> Said:
-        while self.sock.poll(PATIENCE):
+        while self.sock.poll(PATIENCE_MS):
             message = sockets.receive_message(self.sock)
             assert message is not None and not isinstance(message, m.Error), message
             self.heard.append(message)
@@ -72,19 +72,19 @@ class Client:
 class Hovers:
     """What any policy file is here."""
 
-    def choose(self, sight: Sight) -> int:
+    def choose(self, state: LocalState) -> int:
         return N_ACTIONS - 1
 
 
 class Uav:
-    """A process of UAV 0: it says hello, and takes the flight up."""
+    """A process of UAV 0: it says hello, and takes the episode up."""
 
-    def __init__(self, client: Client, world: World, life: int) -> None:
+    def __init__(self, client: Client, world: World, incarnation: int) -> None:
         self.client = client
         tracks = TableTracks(TrackTable(1, world.config.training.ticks), 0)
-        planner = None if world.config.team.pilot == "policy" else Hovers()
-        self.pilot = Pilot(world, 0, life, tracks, Observer(world), lambda _: Hovers(), planner)
-        client.say(m.Hello("uav", 0, life))
+        planner = None if world.config.team.controller == "policy" else Hovers()
+        self.pilot = Pilot(world, 0, incarnation, tracks, ObservationBuilder(world), lambda _: Hovers(), planner)
+        client.say(m.Hello("uav", 0, incarnation))
         self.begin = client.hear(m.Begin)
         self._obey(self.pilot.begin(self.begin))
 
@@ -131,7 +131,7 @@ def client(tmp_path: Path) -> Iterator[Callable[[str], Client]]:
 def endpoint_of(name: str, folder: Path) -> str:
     """Where a client finds the TMC."""
     endpoint = f"ipc://{folder}/sync"
-    return sockets.feed_endpoint(endpoint) if name == LEARNER else endpoint
+    return sockets.learner_endpoint(endpoint) if name == LEARNER else endpoint
 
 
 @contextmanager
@@ -165,7 +165,7 @@ def test_a_policy_is_committed_before_an_answer_names_it(
     recover(station, left, 0.0)
     assert station.roster[0].policy == version == (1 if named == "at the begin" else 2)
     assert station.policies.find(version) == (version, b"policy %d" % version)
-    assert station.flight is not None and station.flight.reported[0] == reached
+    assert station.episode is not None and station.episode.reported[0] == reached
 
 
 def test_an_exchange_that_is_repeated_names_the_same_policy(
@@ -185,7 +185,7 @@ def test_an_exchange_that_is_repeated_names_the_same_policy(
         again = [uav.exchange() for _ in range(5)]
         assert [(a.tick, a.policy) for a in again] == [(a.tick, a.policy) for a in lost]
         while (answer := uav.exchange()).policy == 1:
-            assert answer.tick <= lost[-1].tick + LEAD, "the newer policy is never named"
+            assert answer.tick <= lost[-1].tick + MAX_TICKS_UNCOMMITTED, "the newer policy is never named"
         assert answer.policy == 2
 
 
@@ -195,17 +195,19 @@ def test_answers_are_not_far_ahead_of_what_is_committed(
     with killed_in_the_end(world, tmp_path):
         push(client(LEARNER), 1)
         uav = Uav(client("uav-000"), world, 1)
-        while (answer := uav.exchange()).tick < 2 * LEAD:
+        while (answer := uav.exchange()).tick < 2 * MAX_TICKS_UNCOMMITTED:
             pass
     left, station = journal_in(tmp_path), Station(world, "run", learning=True)
     assert left is not None
     recover(station, left, 0.0)
-    assert station.flight is not None and answer.tick - LEAD <= station.flight.reported[0] < answer.tick
+    assert (
+        station.episode is not None and answer.tick - MAX_TICKS_UNCOMMITTED <= station.episode.reported[0] < answer.tick
+    )
 
 
 def test_an_episode_is_committed_before_the_next_one_begins(client: Callable[[str], Client], tmp_path: Path) -> None:
     """Nobody could tell a process that flew its end again where the others were."""
-    short = World(build({**VALUES, "training.ticks": 20, "training.episodes": 2, "team.pilot": "planner:greedy"}))
+    short = World(build({**VALUES, "training.ticks": 20, "training.episodes": 2, "team.controller": "planner:greedy"}))
     with killed_in_the_end(short, tmp_path):
         uav = Uav(client("uav-000"), short, 1)
         while uav.exchange().tick < 20:
@@ -219,7 +221,7 @@ def test_an_episode_is_committed_before_the_next_one_begins(client: Callable[[st
 
 def test_a_tmc_that_was_stopped_blames_nobody_for_the_silence(client: Callable[[str], Client], tmp_path: Path) -> None:
     """As by a suspended machine, or a commit that a slow disk holds up."""
-    short = World(build({**VALUES, "comms.lost_after": 3.0, "team.pilot": "planner:greedy"}))
+    short = World(build({**VALUES, "comms.lost_after": 3.0, "team.controller": "planner:greedy"}))
     with killed_in_the_end(short, tmp_path) as tmc:
         uav = Uav(client("uav-000"), short, 1)
         for _ in range(2):
@@ -232,7 +234,7 @@ def test_a_tmc_that_was_stopped_blames_nobody_for_the_silence(client: Callable[[
 
 
 def test_a_loss_is_committed_before_anybody_is_told(client: Callable[[str], Client], tmp_path: Path) -> None:
-    silent = World(build({**VALUES, "comms.lost_after": 1.0, "team.pilot": "planner:greedy"}))
+    silent = World(build({**VALUES, "comms.lost_after": 1.0, "team.controller": "planner:greedy"}))
     with killed_in_the_end(silent, tmp_path):
         uav = client("uav-000")
         uav.say(m.Hello("uav", 0, 1))

@@ -1,4 +1,4 @@
-"""The TMC's core: who may say what when, exactly once, and a lost process leaves no trace in the flight."""
+"""The TMC's core: who may say what when, exactly once, and a lost process leaves no trace in the episode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tmc.wire import messages as m
 from tmc.wire.codec import encode
 
 SMALL = {"team.size": 2, "training.ticks": 12, "comms.period": 4}
-LEARN = {**SMALL, "dqn.batch": 4, "replay.learn_start": 4, "replay.slack": 2, "training.episodes": 2}
+LEARN = {**SMALL, "dqn.batch_size": 4, "replay.learn_start": 4, "replay.error_buffer": 2, "training.episodes": 2}
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def station_of(town: RoadMap) -> Callable[..., Station]:
 
     def make(values: dict[str, Any] | None = None, *, learning: bool = False, **more: Any) -> Station:
         pilot = "policy" if learning or "policy" in more else "planner:greedy"
-        config = build({**SMALL, "training.episodes": 1, "team.pilot": pilot, **(values or {})})
+        config = build({**SMALL, "training.episodes": 1, "team.controller": pilot, **(values or {})})
         return Station(World(config, town), "run-1", learning=learning, **more)
 
     return make
@@ -51,39 +51,39 @@ def kinds(sends: list[tuple[str, m.Message]]) -> list[tuple[str, str]]:
     return [(to, type(message).__name__) for to, message in sends]
 
 
-def hello(station: Station, i: int, life: int = 1) -> list[tuple[str, m.Message]]:
-    station.handle(uav_name(i), m.Hello("uav", i, life), 1.0)
+def hello(station: Station, i: int, incarnation: int = 1) -> list[tuple[str, m.Message]]:
+    station.handle(uav_name(i), m.Hello("uav", i, incarnation), 1.0)
     return sent(station)
 
 
-def first_record(station: Station, i: int, life: int = 1, **fields: Any) -> m.Record:
+def first_record(station: Station, i: int, incarnation: int = 1, **fields: Any) -> m.Record:
     """What UAV i ships at tick 0."""
-    assert station.flight is not None
+    assert station.episode is not None
     none = np.zeros(0, "u1")
-    cells = np.array([station.flight.starts[i]], "<u2")
-    record = m.Record(i, life, 0, 1, 0, 0, 0, 0, cells, none, none, np.zeros(0, "<f4"), m.EMPTY, m.EMPTY)
+    cells = np.array([station.episode.starts[i]], "<u2")
+    record = m.Record(i, incarnation, 0, 1, 0, 0, 0, 0, cells, none, none, np.zeros(0, "<f4"), m.EMPTY, m.EMPTY)
     return dataclasses.replace(record, **fields)
 
 
-def next_record(station: Station, i: int, first: int, tick: int, sequence: int, life: int = 1) -> m.Record:
+def next_record(station: Station, i: int, first: int, tick: int, sequence: int, incarnation: int = 1) -> m.Record:
     """UAV i stays where it is."""
-    assert station.flight is not None
+    assert station.episode is not None
     n = tick - first + 1
-    cells = np.full(n, station.flight.starts[i], "<u2")
+    cells = np.full(n, station.episode.starts[i], "<u2")
     moves = tick - max(first, 1) + 1
     stay, zero = np.full(moves, 8, "u1"), np.zeros(moves, "u1")
     reward = np.zeros(moves, "<f4")
-    return m.Record(i, life, sequence, 1, first, tick, 0, 0, cells, stay, zero, reward, m.EMPTY, m.EMPTY)
+    return m.Record(i, incarnation, sequence, 1, first, tick, 0, 0, cells, stay, zero, reward, m.EMPTY, m.EMPTY)
 
 
 def state(station: Station) -> bytes:
     """All that a message may not change when it is rejected; it is counted all the same."""
     out = {"out", "rejected", "world", "config", "observer", "reward", "replay", "flight", "roster"}
     parts: list[Any] = [{k: v for k, v in vars(station).items() if k not in out}]
-    parts += [(member.life, member.sequence, member.answer) for member in station.roster]
+    parts += [(member.incarnation, member.sequence, member.answer) for member in station.roster]
     parts.append({k: v.data for k, v in vars(station.replay).items() if isinstance(v, Ring)})
-    if station.flight is not None:
-        parts.append({k: v for k, v in vars(station.flight).items() if k not in {"world", "reward", "replay"}})
+    if station.episode is not None:
+        parts.append({k: v for k, v in vars(station.episode).items() if k not in {"world", "reward", "replay"}})
     return pickle.dumps(parts)
 
 
@@ -153,7 +153,7 @@ def test_learning_uavs_wait_for_a_policy(station_of: Callable[..., Station]) -> 
 
 def test_planners_do_not_wait_for_the_learner(station_of: Callable[..., Station]) -> None:
     """What it names as missing is what the mission really waits for."""
-    station = station_of({"team.pilot": "planner:greedy"}, learning=True)
+    station = station_of({"team.controller": "planner:greedy"}, learning=True)
     hello(station, 0)
     assert station.waiting_for() == ["uav-001"]
     hello(station, 1)
@@ -262,7 +262,7 @@ def test_a_process_that_the_tmc_does_not_know_is_not_sent_away(
 
 
 def test_a_malformed_record_is_rejected(flying: Station) -> None:
-    jump = dataclasses.replace(first_record(flying, 0), cells=np.array([flying.flight.starts[1]], "<u2"))  # type: ignore[union-attr]
+    jump = dataclasses.replace(first_record(flying, 0), cells=np.array([flying.episode.starts[1]], "<u2"))  # type: ignore[union-attr]
     rejects(flying, "uav-000", jump, "refused", "did not start on cell")
 
 
@@ -276,19 +276,19 @@ def test_nobody_ships_for_another(flying: Station) -> None:
 
 def test_an_old_life_is_fenced(flying: Station) -> None:
     """A newer process flies the UAV: the older one is told to leave, and what it ships changes nothing."""
-    sends = hello(flying, 0, life=2)
+    sends = hello(flying, 0, incarnation=2)
     assert kinds(sends) == [("uav-000", "Welcome"), ("uav-000", "Begin")]
-    rejects(flying, "uav-000", first_record(flying, 0, life=1), "fenced", "newer process flies uav-000")
-    flying.handle("uav-000", first_record(flying, 0, life=2), 2.0)
-    assert flying.flight is not None and flying.flight.reported == [0, -1]
+    rejects(flying, "uav-000", first_record(flying, 0, incarnation=1), "fenced", "newer process flies uav-000")
+    flying.handle("uav-000", first_record(flying, 0, incarnation=2), 2.0)
+    assert flying.episode is not None and flying.episode.reported == [0, -1]
 
 
 def test_an_old_life_cannot_come_back(flying: Station) -> None:
     """A process that hung while its successor took over says hello when it wakes up: it must not fence the new one."""
-    hello(flying, 0, life=2)
+    hello(flying, 0, incarnation=2)
     rejects(flying, "uav-000", m.Hello("uav", 0, 1), "fenced", "newer process flies uav-000")
-    flying.handle("uav-000", first_record(flying, 0, life=2), 2.0)
-    assert flying.flight is not None and flying.flight.reported == [0, -1]
+    flying.handle("uav-000", first_record(flying, 0, incarnation=2), 2.0)
+    assert flying.episode is not None and flying.episode.reported == [0, -1]
 
 
 def test_a_beacon_reaches_those_it_names(flying: Station) -> None:
@@ -307,7 +307,7 @@ def test_status_says_who_is_waited_for(flying: Station) -> None:
 
 def test_status_of_a_large_team_still_fits(toronto: RoadMap) -> None:
     """300 names are more than the 1024 characters of the field."""
-    config = build({"team.size": 300, "team.pilot": "planner:random", "training.ticks": 5})
+    config = build({"team.size": 300, "team.controller": "planner:random", "training.ticks": 5})
     station = Station(World(config, toronto), "run", learning=False)
     station.handle("observer-9", m.StatusRequest(), 1.0)
     ((_, status),) = sent(station)
@@ -315,7 +315,7 @@ def test_status_of_a_large_team_still_fits(toronto: RoadMap) -> None:
 
 
 def test_a_silent_uav_is_named_once(flying: Station) -> None:
-    patience = flying.config.comms.patience
+    patience = flying.config.comms.silence_warning
     flying.handle("uav-000", first_record(flying, 0), 5.0)
     flying.out.take()
     flying.tick(1.0 + patience)
@@ -340,8 +340,8 @@ def test_a_silent_uav_is_named_once(flying: Station) -> None:
 
 def test_who_waits_for_a_lost_uav_is_told_again_that_it_is_lost(flying: Station) -> None:
     """The first telling may have been lost with a connection, or with a TMC that was killed."""
-    assert flying.flight is not None
-    flying.lose(flying.flight, 1)
+    assert flying.episode is not None
+    flying.lose(flying.episode, 1)
     flying.out.take()
     flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 5.0)
     ((to, lost),) = flying.out.take().sends
@@ -356,7 +356,7 @@ def test_who_shares_no_table_is_told_where_a_lost_uav_was(station_of: Callable[.
     station = station_of(tracks=tracks)
     hello(station, 0)
     hello(station, 1)
-    assert station.flight is not None
+    assert station.episode is not None
     for i, record in (
         (0, first_record(station, 0)),
         (1, first_record(station, 1)),
@@ -364,12 +364,12 @@ def test_who_shares_no_table_is_told_where_a_lost_uav_was(station_of: Callable[.
     ):
         station.handle(uav_name(i), record, 1.0)
     sent(station)
-    station.lose(station.flight, 1)
+    station.lose(station.episode, 1)
     told = [message for to, message in sent(station) if to == "uav-000"]
-    cells = np.full(4, station.flight.starts[1], "<u2")
+    cells = np.full(4, station.episode.starts[1], "<u2")
     beacons = [] if tracks else [m.Beacon(1, 1, 1, cells, np.array([0], "<u2"))]
     assert [frames(x) for x in told] == [frames(x) for x in (*beacons, m.Lost(1, 1, 4))]
-    again = [message for _, message in hello(station, 0, life=2)]  # its next process is told before it flies on
+    again = [message for _, message in hello(station, 0, incarnation=2)]  # its next process is told before it flies on
     assert [type(x) for x in again] == [m.Welcome, *(type(x) for x in beacons), m.Begin, m.Map]
 
 
@@ -380,16 +380,16 @@ def test_a_flight_is_taken_up_by_the_map_that_its_uav_was_given(station_of: Call
     hello(station, 1)
     station.handle("uav-000", first_record(station, 0), 1.0)
     station.handle("uav-001", next_record(station, 1, 0, 2, 0), 1.0)
-    assert (station.version, station.flight is not None) == (2, True)
+    assert (station.version, station.episode is not None) == (2, True)
     for i, version in ((0, 1), (1, 2)):
-        (taken_up,) = (x for _, x in hello(station, i, life=2) if isinstance(x, m.Begin))
+        (taken_up,) = (x for _, x in hello(station, i, incarnation=2) if isinstance(x, m.Begin))
         assert taken_up.version == version
 
 
 def test_a_lost_uav_that_is_there_after_all_is_lost_once_and_has_no_part_in_the_episode(flying: Station) -> None:
-    assert flying.flight is not None
+    assert flying.episode is not None
     patience = flying.config.comms.lost_after
-    flying.lose(flying.flight, 1)
+    flying.lose(flying.episode, 1)
     flying.out.take()
     flying.handle("uav-001", m.Alive(1, 1, 0, -1, 0), 5.0)
     assert kinds(flying.out.take().sends) == [("uav-001", "Error")]
@@ -398,7 +398,7 @@ def test_a_lost_uav_that_is_there_after_all_is_lost_once_and_has_no_part_in_the_
     flying.handle("uav-000", m.Alive(0, 1, 0, -1, 0), 6.0 + patience)
     flying.tick(7.0 + patience)
     assert flying.out.take().entries == [] and away(flying.roster) == [1]
-    flying.flight = None
+    flying.episode = None
     flying.begin_episode([1])
     assert [to for to, message in flying.out.take().sends if isinstance(message, m.Begin)] == ["uav-000"]
 
@@ -438,8 +438,8 @@ class Learning:
 
     def ship(self, first: int, tick: int) -> list[tuple[str, m.Message]]:
         """Both UAVs ship ticks first..tick of the current episode."""
-        assert self.station.flight is not None
-        episode = self.station.flight.episode
+        assert self.station.episode is not None
+        episode = self.station.episode.number
         records = [
             first_record(self.station, i, episode=episode, sequence=self.sequence)
             if tick == 0
@@ -472,7 +472,7 @@ def test_minibatches_come_as_they_are_owed(learning: Learning) -> None:
     for b in batches:
         assert isinstance(b, m.Minibatch)
         assert (b.episodes, b.ticks, b.u.shape[0], b.reward.shape) == (0, 8, 8, (4,))
-    assert learning.station.limiter.owed == 2
+    assert learning.station.rate_limiter.samples_due == 2
 
 
 def test_the_limiter_holds_answers_back_and_releases_them(learning: Learning) -> None:
@@ -503,17 +503,17 @@ def test_the_next_episode_does_not_get_around_the_limiter(learning: Learning) ->
     first, T = 1, learning.station.config.training.ticks
     while first <= T:
         sends = learning.ship(first, min(first + 3, T))
-        while not sends and learning.station.limiter.owed > 2 and first + 3 < T:
+        while not sends and learning.station.rate_limiter.samples_due > 2 and first + 3 < T:
             sends = learning.ask(100)
         first += 4
-    flight = learning.station.flight
-    assert flight is not None and flight.episode == 2 and learning.station.waiting_for() == ["learner"]
+    episode = learning.station.episode
+    assert episode is not None and episode.number == 2 and learning.station.waiting_for() == ["learner"]
     last = dataclasses.replace(next_record(learning.station, 0, first - 4, T, learning.sequence - 1), episode=1)
     learning.station.handle("uav-000", last, 1.0)
     assert sent(learning.station) == []
     learning.station.handle("uav-001", m.Hello("uav", 1, 99), 1.0)
     assert kinds(sent(learning.station)) == [("uav-001", "Welcome")]
-    sends = [send for n in range(learning.station.limiter.owed) for send in learning.ask(n)]
+    sends = [send for n in range(learning.station.rate_limiter.samples_due) for send in learning.ask(n)]
     assert {(to, x.episode) for to, x in sends if isinstance(x, m.Begin)} == {("uav-000", 2), ("uav-001", 2)}
 
 
@@ -523,14 +523,14 @@ def test_there_is_one_learner_and_who_it_replaced_is_told_so(learning: Learning)
     assert kinds(sent(station)) == [("learner", "Welcome")]
     for late in (
         m.Hello("learner", -1, 5, 900),
-        m.PolicyPush(7, 9, 0.0, b"late", life=5),
-        m.SampleRequest(3, life=5),
+        m.PolicyPush(7, 9, 0.0, b"late", incarnation=5),
+        m.SampleRequest(3, incarnation=5),
     ):
         station.handle(LEARNER, late, 1.0)
         ((to, error),) = sent(station)
-        assert to == LEARNER and isinstance(error, m.Error) and (error.code, error.life) == ("fenced", 5)
+        assert to == LEARNER and isinstance(error, m.Error) and (error.code, error.incarnation) == ("fenced", 5)
     assert station.policies.newest == 1
-    station.handle(LEARNER, m.PolicyPush(2, 0, 0.0, b"mine", life=6), 1.0)
+    station.handle(LEARNER, m.PolicyPush(2, 0, 0.0, b"mine", incarnation=6), 1.0)
     assert kinds(sent(station)) == [("learner", "Ack")] and station.policies.newest == 2
 
 
@@ -541,9 +541,11 @@ def test_at_most_eight_requests_are_in_flight(learning: Learning) -> None:
 
 def test_errors_that_cannot_be_are_refused(learning: Learning, station_of: Callable[..., Station]) -> None:
     index, errors = np.arange(4), np.ones(3, "<f4")
-    on = Learning(station_of({**LEARN, "replay.priority": 0.6}, learning=True)).station
+    on = Learning(station_of({**LEARN, "replay.priority_exponent": 0.6}, learning=True)).station
     rejects(on, LEARNER, m.SampleRequest(1, index, errors), "refused", "an error for each transition")
-    rejects(learning.station, LEARNER, m.SampleRequest(1, index[:3], errors), "refused", "replay.priority is 0")
+    rejects(
+        learning.station, LEARNER, m.SampleRequest(1, index[:3], errors), "refused", "replay.priority_exponent is 0"
+    )
 
 
 def test_only_the_learner_learns(learning: Learning, flying: Station) -> None:
@@ -579,22 +581,22 @@ def test_the_policy_of_an_answer_can_be_had_as_long_as_it_may_be_asked_for(learn
 
 
 def test_a_learner_from_an_older_checkpoint_is_owed_what_it_lost(learning: Learning) -> None:
-    """Minibatch 0 of the second life is minibatch 0 of the first, drawn again."""
+    """Minibatch 0 of the second incarnation is minibatch 0 of the first, drawn again."""
     learning.ship(0, 0)
     learning.ship(1, 4)
     learning.ship(5, 8)
     first = learning.ask(0, 1, 2, 3)
     station = learning.station
-    assert (station.limiter.owed, station.limiter.updates) == (0, 4)
+    assert (station.rate_limiter.samples_due, station.rate_limiter.updates) == (0, 4)
     assert learning.ask(4, 5) == []
     station.handle(LEARNER, m.Hello("learner", -1, 6, updates=1), 1.0)
     assert kinds(sent(station)) == [("learner", "Welcome")]
-    assert (station.limiter.owed, station.limiter.updates) == (3, 1)
+    assert (station.rate_limiter.samples_due, station.rate_limiter.updates) == (3, 1)
     again = learning.ask(1)
     batches = [x for to, x in first if to == LEARNER]
     assert frames(again[0][1]) == frames(batches[1])
     station.handle(LEARNER, m.Hello("learner", -1, 6, updates=0), 1.0)  # a repeat takes nothing back
-    assert station.limiter.updates == 2
+    assert station.rate_limiter.updates == 2
     sent(station)
 
 
@@ -605,17 +607,17 @@ def finish(learning: Learning) -> list[tuple[str, m.Message]]:
         learning.ship(0, 0)
         for first, tick in ((1, 4), (5, 8), (9, 12)):
             sends = learning.ship(first, tick)
-            while learning.station.limiter.owed > (0 if tick < 12 else 2):
+            while learning.station.rate_limiter.samples_due > (0 if tick < 12 else 2):
                 sends += learning.ask(0)
     return sends
 
 
 @pytest.mark.parametrize("in_flight", [1, 3])
 def test_the_end_reaches_everybody(learning: Learning, in_flight: int) -> None:
-    """With one request in flight or several, the learner learns of the end, and so do the UAVs."""
+    """With one request in episode or several, the learner learns of the end, and so do the UAVs."""
     finish(learning)
     station = learning.station
-    assert station.phase == "learning" and station.flight is None
+    assert station.phase == "learning" and station.episode is None
     sends = learning.ask(*range(in_flight))
     while not any(isinstance(x, m.End) for _, x in sends):
         sends += learning.ask(7)
@@ -633,7 +635,7 @@ def test_a_learner_that_comes_back_after_the_end_is_told(learning: Learning) -> 
     station = learning.station
     learning.ask(0, 1, 2)
     assert station.phase == "done"
-    station.handle(LEARNER, m.Hello("learner", -1, 77, updates=station.limiter.updates - 2), 1.0)
+    station.handle(LEARNER, m.Hello("learner", -1, 77, updates=station.rate_limiter.updates - 2), 1.0)
     sent(station)
     assert station.phase == "learning"
     sends = learning.ask(0, 1, 2)
@@ -646,12 +648,12 @@ def test_a_learner_that_did_not_hear_of_the_end_is_told_again(learning: Learning
     station = learning.station
     learning.ask(0, 1, 2)
     assert station.phase == "done"
-    station.handle(LEARNER, m.Hello("learner", -1, station.feed.life, station.limiter.updates), 1.0)
+    station.handle(LEARNER, m.Hello("learner", -1, station.sample_queue.incarnation, station.rate_limiter.updates), 1.0)
     assert kinds(sent(station)) == [("learner", "Welcome"), ("learner", "End")]
 
 
 def test_a_mission_without_a_learner_ends_with_its_last_record(mission: Callable[..., Any], town: RoadMap) -> None:
-    flown = mission({**SMALL, "training.episodes": 3, "team.pilot": "planner:greedy"}, town).play(Random(1))
+    flown = mission({**SMALL, "training.episodes": 3, "team.controller": "planner:greedy"}, town).play(Random(1))
     assert flown.home == {0, 1} and flown.station.phase == "done" and flown.station.episodes == 3
     phases = [(e.values["episode"], e.values["phase"]) for e in flown.entries if e.topic == "/tmc/episode"]
     assert phases == [(e, p) for e in (1, 2, 3) for p in ("begin", "end")]
@@ -675,9 +677,9 @@ def test_the_same_messages_give_the_same_answers(mission: Callable[..., Any], to
 
 
 PILOTS = {
-    "greedy": {"team.pilot": "planner:greedy"},
-    "greedy, scenario 1": {"team.pilot": "planner:greedy", "scenario": 1},
-    "random road": {"team.pilot": "planner:random-road", "world.initial_map": "random"},
+    "greedy": {"team.controller": "planner:greedy"},
+    "greedy, scenario 1": {"team.controller": "planner:greedy", "scenario": 1},
+    "random road": {"team.controller": "planner:random-road", "world.initial_map": "random"},
     "epsilon-greedy": {"exploration.end": 0.3, "comms.phase": "staggered", "comms.period": 7},
 }
 
@@ -687,11 +689,11 @@ PILOTS = {
 def test_lost_uavs_come_back_and_fly_the_same_cells(
     mission: Callable[..., Any], town: RoadMap, pilots: str, seed: int
 ) -> None:
-    """Processes die at random ticks, with their records lost or not: the journal holds the undisturbed flight."""
+    """Processes die at random ticks, with their records lost or not: the journal holds the undisturbed episode."""
     values = {"team.size": 4, "training.ticks": 40, "training.episodes": 2, **PILOTS[pilots]}
     calm = mission(values, town).play()
     rough = mission(values, town).play(Random(seed), crash=0.03)
-    assert sum(rough.lives) > 4 + 3, "nobody was lost"
+    assert sum(rough.incarnations) > 4 + 3, "nobody was lost"
     assert rough.flown() == calm.flown()
     uncertainty = [[e.values["uncertainty"] for e in f.entries if e.topic == "/tmc/episode"] for f in (calm, rough)]
     assert uncertainty[0] == uncertainty[1]
@@ -740,5 +742,5 @@ def test_lost_uavs_with_beacons_come_back(mission: Callable[..., Any], town: Roa
     """What a process knew of the others, and they had not heard of it, is lost with it; so it is asked for."""
     values = {"team.size": 3, "training.ticks": 30, "scenario": scenario}
     flown = mission(values, town, radio=True).play(Random(seed), crash=0.02)
-    assert sum(flown.lives) > 3
+    assert sum(flown.incarnations) > 3
     assert flown.flown() == mission(values, town).play().flown()

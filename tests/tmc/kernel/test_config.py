@@ -23,7 +23,7 @@ CHOICES = [s.key for s in SETTINGS.values() if get_origin(s.type) is Literal]
 TABLE_I = {
     "dqn.learning_rate": 0.001,
     "replay.capacity": 100_000,
-    "dqn.batch": 128,
+    "dqn.batch_size": 128,
     "dqn.target_episodes": 5,
     "dqn.gamma": 0.99,
     "network.kernel": 4,
@@ -69,7 +69,9 @@ def test_every_default_of_table_i_names_it(key: str) -> None:
     assert SETTINGS[key].default == TABLE_I[key]
 
 
-@pytest.mark.parametrize("key", ["comms.period", "training.ticks", "world.alpha", "comms.patience", "replay.capacity"])
+@pytest.mark.parametrize(
+    "key", ["comms.period", "training.ticks", "world.alpha", "comms.silence_warning", "replay.capacity"]
+)
 def test_quantities_have_a_unit(key: str) -> None:
     assert SETTINGS[key].unit
 
@@ -225,7 +227,7 @@ def test_unknown_keys_are_refused_with_a_hint(key: str, hint: str) -> None:
         ("network.channels", [math.nan]),
         ("world.map", None),
         ("world.map", ["downtown-toronto"]),
-        ("team.pilot", {"name": "policy"}),
+        ("team.controller", {"name": "policy"}),
         ("world.rates", False),
     ],
 )

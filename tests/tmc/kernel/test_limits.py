@@ -44,11 +44,11 @@ def test_what_would_learn_nothing_is_refused_with_its_figures(values: dict[str, 
 
 def test_what_a_training_will_not_do_is_said() -> None:
     def remarks(**values: Any) -> list[str]:
-        return list(limits.remarks(build({**SHORT, "replay.learn_start": 10, "training.push_every": 5, **values})))
+        return list(limits.remarks(build({**SHORT, "replay.learn_start": 10, "training.publish_every": 5, **values})))
 
     made = limits.updates(build({**SHORT, "replay.learn_start": 10}))
     assert remarks() == []
-    [never] = remarks(**{"training.push_every": made + 1})
+    [never] = remarks(**{"training.publish_every": made + 1})
     assert f"{made} updates" in never and "policies/final.onnx alone" in never
     [still] = remarks(**{"dqn.target_episodes": 0, "dqn.target_updates": made + 1})
     assert "the target network stays as it is at the start" in still
@@ -68,7 +68,7 @@ class Counting:
         self.version += 1
         return self.version, b"model"
 
-    def judged(self) -> tuple[()]:
+    def take_td_errors(self) -> tuple[()]:
         return ()
 
 
@@ -96,9 +96,9 @@ def test_the_updates_that_a_training_makes_are_known_before(values: dict[str, An
     """Exactly as many as were said where all UAVs exchange together, never more where they do so in turn."""
     config = build(values)
     flown = LockStep(World(config, parse_raster("####\n#..#\n####")), None, lambda _: None, trainer := Counting())
-    flown._intake = type("Intake", (), {"read": staticmethod(lambda batch: batch)})()
+    flown._builder = type("BatchBuilder", (), {"build": staticmethod(lambda batch: batch)})()
     for pilot in flown.fleet.pilots:
-        pilot._make_decider = lambda _: Stay()
+        pilot._make_controller = lambda _: Stay()
     flown.run()
     said = limits.updates(config)
     assert trainer.updates == said if values["comms.phase"] == "together" else trainer.updates <= said

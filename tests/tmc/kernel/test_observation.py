@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tmc.kernel.grid import ACTIONS, OFF_GRID, STAY
-from tmc.kernel.observation import EGO, PEER, Observer, Views
+from tmc.kernel.observation import EGO, PEER, ObservationBuilder, Views
 from tmc.kernel.world import World
 
 Worlds = Callable[..., World]
@@ -43,7 +43,7 @@ def states(world: World, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64
     return team[np.arange(B), uav], team, uav, rng.random((B, world.law.cells.size))
 
 
-def peers_of(observer: Observer, cell: int, team: list[int], me: int) -> list[int]:
+def peers_of(observer: ObservationBuilder, cell: int, team: list[int], me: int) -> list[int]:
     """N_i(t) by hand."""
     return [
         k
@@ -55,7 +55,7 @@ def peers_of(observer: Observer, cell: int, team: list[int], me: int) -> list[in
 def test_an_image_drawn_over_in_place_has_the_same_bits(view: dict[str, Any], world_of: Worlds) -> None:
     """Whatever was on it before."""
     world = world_of({"team.size": TEAM, **view})
-    observer = Observer(world)
+    observer = ObservationBuilder(world)
     canvas, image = observer.canvas(), observer.canvas().image
     for cell, team, me, u in zip(*states(world, seed=7), strict=True):
         peers = peers_of(observer, int(cell), team.tolist(), int(me))
@@ -70,7 +70,7 @@ def test_single_and_batch_agree_bit_for_bit(
     scenario: int, settings: dict[str, Any], view: dict[str, Any], world_of: Worlds
 ) -> None:
     world = world_of({"team.size": TEAM, "scenario": scenario, **settings, **view})
-    observer = Observer(world)
+    observer = ObservationBuilder(world)
     cells, team, uav, u = states(world, seed=scenario)
     sensed = observer.sensed(cells, team, uav)
     views = observer.views(cells, team, uav, u.astype("<f4"))
@@ -92,7 +92,7 @@ def test_single_and_batch_agree_bit_for_bit(
 
 def test_observation_of_the_whole_grid(world_of: Worlds) -> None:
     world = world_of()
-    observer = Observer(world)
+    observer = ObservationBuilder(world)
     u = np.linspace(0.1, 0.9, world.law.cells.size)
     position, terrain, uncertainty = observer.observe(7, [8, 14], u).reshape(3, -1)
     assert {k: v for k, v in enumerate(position.tolist()) if v} == {7: EGO, 8: PEER, 14: PEER}
@@ -108,8 +108,8 @@ def test_channel_values() -> None:
 def test_egocentric_view_is_the_whole_view_cut_out(world_of: Worlds) -> None:
     """Shifted so that the UAV stands in the middle; terrain -1 and nothing else beyond the edge."""
     radius = 2
-    whole = Observer(world_of())
-    ego = Observer(world_of({"observation.view": "ego", "observation.radius": radius}))
+    whole = ObservationBuilder(world_of())
+    ego = ObservationBuilder(world_of({"observation.view": "ego", "observation.radius": radius}))
     u = np.linspace(0.1, 0.9, 17)
     padding = [(0, 0), (radius, radius), (radius, radius)]
     for cell in np.flatnonzero(~world_of().map.blocked).tolist():
@@ -122,7 +122,7 @@ def test_egocentric_view_is_the_whole_view_cut_out(world_of: Worlds) -> None:
 
 
 def test_beyond_the_edge_is_terrain_like_an_obstacle(world_of: Worlds) -> None:
-    observer = Observer(world_of({"observation.view": "ego", "observation.radius": 1}))
+    observer = ObservationBuilder(world_of({"observation.view": "ego", "observation.radius": 1}))
     position, terrain, uncertainty = observer.observe(0, [], np.ones(17))
     assert terrain.tolist() == [[-1, -1, -1], [-1, 0, 1], [-1, 1, 1]]
     assert uncertainty.tolist() == [[0, 0, 0], [0, 0, 1], [0, 1, 1]]
@@ -130,7 +130,7 @@ def test_beyond_the_edge_is_terrain_like_an_obstacle(world_of: Worlds) -> None:
 
 
 def test_peers_outside_the_view_are_not_wrapped_into_it(world_of: Worlds) -> None:
-    observer = Observer(world_of({"observation.view": "ego", "observation.radius": 1, "scenario": 1}))
+    observer = ObservationBuilder(world_of({"observation.view": "ego", "observation.radius": 1, "scenario": 1}))
     everywhere = [k for k in range(35) if k != 14]
     position = observer.observe(14, everywhere, np.zeros(17))[0]
     assert position.tolist() == [[0, 0.5, 0.5], [0, 1, 0.5], [0, 0.5, 0.5]]
@@ -138,7 +138,7 @@ def test_peers_outside_the_view_are_not_wrapped_into_it(world_of: Worlds) -> Non
 
 def test_observation_is_written_into_the_buffer(world_of: Worlds, view: dict[str, Any]) -> None:
     """Nothing of an earlier observation stays."""
-    observer = Observer(world_of(view))
+    observer = ObservationBuilder(world_of(view))
     buffer = np.full(observer.shape, 7.0, np.float32)
     fresh = observer.observe(9, [2], np.full(17, 0.25))
     observer.observe(9, [2], np.full(17, 0.25), buffer)
@@ -146,7 +146,7 @@ def test_observation_is_written_into_the_buffer(world_of: Worlds, view: dict[str
 
 
 def test_observing_changes_nothing(world_of: Worlds, view: dict[str, Any]) -> None:
-    observer = Observer(world_of(view))
+    observer = ObservationBuilder(world_of(view))
     u = np.linspace(0, 1, 17)
     first = observer.observe(9, [2], u).copy()
     observer.observe(30, [8], u[::-1].copy())[...] = 3.0
@@ -155,14 +155,14 @@ def test_observing_changes_nothing(world_of: Worlds, view: dict[str, Any]) -> No
 
 @pytest.mark.parametrize(("radius", "seen"), [(0.0, 0), (1.0, 4), (1.5, 8), (2.0, 12)])
 def test_sensed_is_euclidean(radius: float, seen: int, world_of: Worlds) -> None:
-    observer = Observer(world_of({"team.sensing_range": radius}))
+    observer = ObservationBuilder(world_of({"team.sensing_range": radius}))
     centre = 2 * 7 + 3
     team = np.arange(35)[None, :]
     assert observer.sensed(np.array([centre]), team, np.array([centre])).sum() == seen
 
 
 def test_a_uav_does_not_sense_itself_and_in_scenario_i_senses_all(world_of: Worlds) -> None:
-    observer = Observer(world_of({"scenario": 1, "team.sensing_range": 0.0}))
+    observer = ObservationBuilder(world_of({"scenario": 1, "team.sensing_range": 0.0}))
     assert (
         observer.sensed(np.array([5, 5]), np.array([[5, 0, 34]] * 2), np.array([0, 0])).tolist()
         == [[False, True, True]] * 2
@@ -171,7 +171,7 @@ def test_a_uav_does_not_sense_itself_and_in_scenario_i_senses_all(world_of: Worl
 
 def test_allowed_moves_leave_out_edges_obstacles_and_sensed_peers(world_of: Worlds) -> None:
     world = world_of()
-    observer = Observer(world)
+    observer = ObservationBuilder(world)
     for cell in np.flatnonzero(~world.map.blocked).tolist():
         free = [a for a, k in enumerate(world.grid.target_lists[cell]) if k != OFF_GRID and not world.map.blocked[k]]
         assert observer.allowed(cell, []) == free
@@ -183,7 +183,7 @@ def test_allowed_moves_leave_out_edges_obstacles_and_sensed_peers(world_of: Worl
 def test_staying_is_allowed_to_a_uav_that_is_walled_in(world_of: Worlds) -> None:
     """Obstacles on three sides and UAVs in the open cells: there is always one action left."""
     world = world_of({"team.size": 1}, "#X#\nXX.\n##.\n")
-    observer = Observer(world)
+    observer = ObservationBuilder(world)
     assert [ACTIONS[a][0] for a in observer.allowed(0, [])] == ["stay"]
     assert observer.allowed(5, [2, 7, 8]) == [STAY]
     walled_in = Views(np.array([5], "<u2"), np.array([[2, 7, 8]], "<u2"), np.zeros((1, 0), "<f4"))

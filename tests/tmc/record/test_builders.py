@@ -20,7 +20,7 @@ def records(draw):
         return draw(arrays(dtype, draw(st.integers(0, 12)), **options))
 
     return Record(
-        uav=draw(small), life=draw(large), sequence=draw(large), episode=draw(st.integers(1, 2**31 - 1)),
+        uav=draw(small), incarnation=draw(large), sequence=draw(large), episode=draw(st.integers(1, 2**31 - 1)),
         first=draw(small), tick=draw(small), version=draw(large), policy=draw(large),
         cells=some("<u2"), actions=some("u1"), blocks=some("u1"),
         rewards=some("<f4", elements=st.floats(width=32, allow_nan=False, allow_infinity=False)),
@@ -43,7 +43,7 @@ def test_flight_records_come_back_exactly(record):
 
 @pytest.mark.parametrize("bad", [{"cells": [65_536]}, {"actions": [256]}, {"rewards": [float("nan")]}, {"episode": 0}])
 def test_a_flight_record_that_no_uav_may_send_is_refused(bad):
-    with pytest.raises(RecordError, match="flight record of UAV 3 is not sound"):
+    with pytest.raises(RecordError, match="flight record of UAV 3 is not intact"):
         builders.to_record(schemas.FlightRecord(**({"uav": 3, "episode": 1} | bad)))
 
 

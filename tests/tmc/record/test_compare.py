@@ -37,8 +37,8 @@ def log_of_two(folder: Path) -> Path:
         with LogWriter(folder / f"uav-00{uav}.mcap", f"uav-00{uav}", Journal(), {}) as log:
             for first, tick in ((0, 0), (1, 2), (3, 4)):
                 hashes = [100 * uav + t for t in range(max(first, 1) - 1, tick)]
-                message = schemas.Witness(uav=uav, episode=1, first=first, tick=tick, hashes=hashes)
-                log.write(uav_topic(uav, "witness"), message)
+                message = schemas.ObservationHashes(uav=uav, episode=1, first=first, tick=tick, hashes=hashes)
+                log.write(uav_topic(uav, "observation_hash"), message)
             log.write(uav_topic(uav, "status"), schemas.UavStatus(uav=uav, waited=0.25 * uav))
     return folder
 
@@ -46,7 +46,7 @@ def log_of_two(folder: Path) -> Path:
 def flown(uav: int, first: int, tick: int) -> Any:
     ticks, moves = range(first, tick + 1), range(max(first, 1), tick + 1)
     return schemas.FlightRecord(
-        uav=uav, life=77, sequence=tick // 2, episode=1, first=first, tick=tick, version=max(tick - 1, 0),
+        uav=uav, incarnation=77, sequence=tick // 2, episode=1, first=first, tick=tick, version=max(tick - 1, 0),
         cells=[10 + 10 * uav + t for t in ticks], actions=[3 for _ in moves], blocks=[0 for _ in moves],
         rewards=[0.5 * t for t in moves], seen_tick=[t for t in ticks if t], seen_cell=[50 + t for t in ticks if t],
     )  # fmt: skip
@@ -117,7 +117,7 @@ CHANGES: list[tuple[Change, str, int, int]] = [
     (setting("/tmc/metrics", "reward", 1, 0.0, first=3), "team's reward", 4, -1),
     (setting("/tmc/episode", "reward", 1, 2.5, phase="end"), "end of the episode", 4, -1),
     (setting("/tmc/episode", "starts", 1, 21, phase="begin"), "begin of the episode", 0, -1),
-    (setting("/uav/0/witness", "hashes", 1, 1, tick=4), "observation", 3, 0),
+    (setting("/uav/0/observation_hash", "hashes", 1, 1, tick=4), "observation", 3, 0),
 ]
 
 
@@ -144,7 +144,7 @@ def test_a_difference_in_words(original: Path, tmp_path: Path) -> None:
 
 def test_what_one_log_lacks_is_a_difference(original: Path, tmp_path: Path) -> None:
     def drop(name: str, message: Any) -> Iterator[Any]:
-        if not (name == "/uav/1/witness" and message.tick == 4):
+        if not (name == "/uav/1/observation_hash" and message.tick == 4):
             yield message
 
     ours, less = compare.facts_of(original), compare.facts_of(altered(original, tmp_path / "less", drop))
@@ -163,7 +163,7 @@ def test_what_the_schedule_changes_is_no_fact(original: Path, tmp_path: Path) ->
                 )  # fmt: skip
             return
         if name == RECORD:
-            message.life += 1
+            message.incarnation += 1
             yield message
         if name == "/uav/1/status":
             message.waited += 1

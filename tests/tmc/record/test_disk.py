@@ -17,7 +17,7 @@ import pytest
 from tmc.kernel.config import Journal
 from tmc.record import schemas
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import seal_run
+from tmc.record.mcap.compact import compact_run
 from tmc.record.mcap.recover import recover
 from tmc.record.reader import Log, read
 from tmc.record.writer import LogWriter
@@ -27,7 +27,7 @@ import sys, time
 from tmc.kernel.config import Journal
 from tmc.record import schemas
 from tmc.record.writer import LogWriter
-log = LogWriter(sys.argv[1], "tmc", Journal(flush=60), {}, resume=sys.argv[2] == "resume")
+log = LogWriter(sys.argv[1], "tmc", Journal(flush_interval=60), {}, resume=sys.argv[2] == "resume")
 log.write("/tmc/sync", schemas.Sync(tick=7))
 log.flush()
 print("writing", flush=True)
@@ -68,7 +68,7 @@ def test_a_second_writer_is_refused_while_the_first_lives(tmp_path: Path, how: s
                 LogWriter(path, "tmc", Journal(), {}, resume=True)
         with pytest.raises(RecordError, match=r"tmc\.mcap\.active exists already"):
             LogWriter(path, "tmc", Journal(), {})
-        for refused in (lambda: recover(active), lambda: seal_run(tmp_path)):
+        for refused in (lambda: recover(active), lambda: compact_run(tmp_path)):
             with pytest.raises(RecordError, match="is being written by another process"):
                 refused()
         assert active.read_bytes() == whole and names(tmp_path) == ["tmc.mcap.active"]
@@ -146,7 +146,7 @@ def test_a_read_only_folder_is_said_and_keeps_its_logs(shared: Path) -> None:
             lambda: LogWriter(shared / "learner.mcap", "learner", Journal(), {}),
             lambda: LogWriter(shared / "tmc.mcap", "tmc", Journal(), {}, resume=True),
             lambda: recover(log.active),
-            lambda: seal_run(shared),
+            lambda: compact_run(shared),
         ):
             with pytest.raises(RecordError, match=r"cannot be written \(Permission denied\): make its folder exist"):
                 refused()
@@ -168,7 +168,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_disk_that_is_full(small_disk: Path) -> None:
-    log = LogWriter(small_disk / "tmc.mcap", "tmc", Journal(chunk=4096, flush=60.0), {})
+    log = LogWriter(small_disk / "tmc.mcap", "tmc", Journal(chunk=4096, flush_interval=60.0), {})
     with pytest.raises(RecordError, match="is full: free some space and resume; what was flushed stays readable"):
         for n in range(100_000):
             log.write("/learner/policy", schemas.Policy(version=n, model=os.urandom(1000)))

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from deploy import cli
 from deploy.run.lockstep import run
 from deploy.run.progress import Progress
-from tests.command import PATIENCE
+from tests.command import PATIENCE_S
 from tmc.kernel.config import Journal, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas
@@ -32,8 +32,8 @@ T, N = 30, 3
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A mission in lock step with a log of the TMC and one of each UAV."""
     folder = tmp_path_factory.mktemp("flown")
-    values = {"training.ticks": T, "training.episodes": 1, "team.size": N, "team.pilot": "planner:greedy"}
-    config = build(values | {"trial.witness": True})
+    values = {"training.ticks": T, "training.episodes": 1, "team.size": N, "team.controller": "planner:greedy"}
+    config = build(values | {"trial.observation_hash": True})
     (folder / "config.json").write_text(json.dumps(flat(config)))
     run(World(config), folder, None, Progress(config, 1, 0.0))
     return folder
@@ -140,9 +140,9 @@ def test_what_is_sound_of_a_cut_file_is_merged_and_the_damage_is_said(flown: Pat
     (tmp_path / "uav-001.mcap").rename(tmp_path / "uav-001.mcap.active")
     (tmp_path / "uav-002.mcap").write_bytes(b"")
     merged = merge(run_files(tmp_path), tmp_path / "out.mcap")
-    sound = {p: path for p, path in run_files(tmp_path).items() if p != "uav-002"}
-    assert Counter(of_merged(merged.path)) == of_source(sound)
-    assert {row[0] for row in of_merged(merged.path)} == set(sound)
+    intact = {p: path for p, path in run_files(tmp_path).items() if p != "uav-002"}
+    assert Counter(of_merged(merged.path)) == of_source(intact)
+    assert {row[0] for row in of_merged(merged.path)} == set(intact)
     assert sorted(text.partition(":")[0].rpartition("/")[2] for text in merged.damage) == [
         "tmc.mcap", "uav-002.mcap is empty",
     ]  # fmt: skip
@@ -184,7 +184,7 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, {resource.RLIM_INFINITY}))
 sys.exit(cli.main(["log", "merge", {str(flown)!r}, "--out", {str(tmp_path / "out.mcap")!r}]))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith(f"overfly: {tmp_path / 'out.mcap'} cannot be written")
     assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())

@@ -18,7 +18,7 @@ TICKS = 12
 
 
 def make(path, close=True):
-    log = LogWriter(path, "tmc", Journal(flush=60.0), {"seed": "1"}, clock=lambda: 10**18)
+    log = LogWriter(path, "tmc", Journal(flush_interval=60.0), {"seed": "1"}, clock=lambda: 10**18)
     for tick in range(TICKS):
         log.write("/tmc/sync", schemas.Sync(episode=1, tick=tick, uavs=[0, 1, 2], believed=tick / 3))
         if tick % 4 == 3:
@@ -111,7 +111,7 @@ def test_an_active_file_with_a_damaged_stretch_invents_nothing(tmp_path, active,
 def test_a_chunk_that_went_missing_ends_the_reading(tmp_path):
     """A damaged opcode hides a whole chunk: the numbers of the messages show the gap."""
     path = tmp_path / "tmc.mcap"
-    log = LogWriter(path, "tmc", Journal(flush=60.0), {})
+    log = LogWriter(path, "tmc", Journal(flush_interval=60.0), {})
     bounds = []
     for tick in range(3):
         bounds.append((tmp_path / "tmc.mcap.active").stat().st_size)

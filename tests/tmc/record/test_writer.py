@@ -16,7 +16,7 @@ from tmc.record.errors import RecordError
 from tmc.record.reader import Log, read, run_files
 from tmc.record.writer import LogWriter
 
-LAZY = Journal(flush=60.0)
+LAZY = Journal(flush_interval=60.0)
 
 
 def writer(path, process="tmc", **options):
@@ -140,7 +140,7 @@ from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.writer import LogWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-log = LogWriter({str(tmp_path / "tmc.mcap")!r}, "tmc", Journal(flush=60), {{}})
+log = LogWriter({str(tmp_path / "tmc.mcap")!r}, "tmc", Journal(flush_interval=60), {{}})
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 done = 0
 try:
@@ -172,7 +172,7 @@ print(done, first)
 
 def test_flush_is_due_after_the_configured_time(tmp_path):
     now = [0.0]
-    log = LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(flush=0.5), {}, timer=lambda: now[0])
+    log = LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(flush_interval=0.5), {}, timer=lambda: now[0])
     held = lambda: len(list(read(tmp_path / "tmc.mcap.active")))  # noqa: E731
     log.write("/tmc/sync", sync(0))
     log.maybe_flush()
@@ -193,7 +193,7 @@ import sys
 from tmc.kernel.config import Journal
 from tmc.record import schemas
 from tmc.record.writer import LogWriter
-log = LogWriter(sys.argv[1], "tmc", Journal(flush=60), {})
+log = LogWriter(sys.argv[1], "tmc", Journal(flush_interval=60), {})
 for tick in range(10**9):
     log.write("/tmc/sync", schemas.Sync(tick=tick, uavs=range(tick % 7)))
     if tick % 50 == 49:

@@ -69,10 +69,10 @@ def test_settings_whose_text_is_too_long_are_refused() -> None:
 
 def test_a_minibatch_that_no_frame_takes_is_refused_and_the_fix_that_is_named_is_one() -> None:
     raster = "\n".join(["#" * 60] * 60)
-    text = refused(world_of(raster, **{"dqn.batch": 60_000}))
+    text = refused(world_of(raster, **{"dqn.batch_size": 60_000}))
     most = int(text.rpartition("choose ")[2].partition(" or less")[0])
-    capacity.check(world_of(raster, **{"dqn.batch": most}), learning=True)
-    refused(world_of(raster, **{"dqn.batch": most + 1}))
+    capacity.check(world_of(raster, **{"dqn.batch_size": most}), learning=True)
+    refused(world_of(raster, **{"dqn.batch_size": most + 1}))
 
 
 def test_every_field_that_settings_fill_is_held_to_its_rule() -> None:

@@ -1,4 +1,4 @@
-"""The codec: whatever arrives, `decode` gives a sound message or a CodecError, and never much memory for few bytes."""
+"""The codec: whatever arrives, `decode` gives a intact message or a CodecError, and never much memory for few bytes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def refused(frames: list[Any]) -> CodecError:
 
 
 def survives(frames: list[Any], same: Same) -> None:
-    """A sound message, which makes the same journey again, or a CodecError: nothing else."""
+    """A intact message, which makes the same journey again, or a CodecError: nothing else."""
     try:
         message = decode(frames)
     except CodecError as error:

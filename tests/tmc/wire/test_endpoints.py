@@ -17,7 +17,7 @@ from tmc.wire.endpoints import LONGEST_PATH, Endpoint, EndpointError, parse
 from tmc.wire.messages import PolicyRequest
 
 USES: dict[str, Callable[[str], object]] = {
-    "bind": endpoints.to_bind, "connect": endpoints.to_connect, "the learner's": endpoints.feed_endpoint,
+    "bind": endpoints.to_bind, "connect": endpoints.to_connect, "the learner's": endpoints.learner_endpoint,
 }  # fmt: skip
 """Everything that an endpoint of a user comes to."""
 

@@ -15,7 +15,7 @@ import pytest
 from tmc.wire import process
 from tmc.wire.process import DONE, FAILED, FENCED, USAGE, die_with_parent, run
 
-PATIENCE = 100.0
+PATIENCE_S = 100.0
 ROOT = Path(process.__file__).parents[2]
 CHILD = """
 import os, sys, time
@@ -63,7 +63,7 @@ def start() -> Iterator[Start]:
 def line(child: subprocess.Popen[str]) -> str:
     """The next line that a process prints."""
     assert child.stdout is not None
-    assert select.select([child.stdout], [], [], PATIENCE)[0], "it says nothing"
+    assert select.select([child.stdout], [], [], PATIENCE_S)[0], "it says nothing"
     return child.stdout.readline().strip()
 
 
@@ -86,7 +86,7 @@ def test_a_child_dies_when_its_parent_is_killed(start: Start) -> None:
     try:
         assert not ended(child, 0.1)
         parent.send_signal(signal.SIGKILL)
-        assert ended(child, PATIENCE)
+        assert ended(child, PATIENCE_S)
     finally:
         if not ended(child, 0):
             os.kill(child, signal.SIGKILL)
@@ -99,7 +99,7 @@ def test_a_child_without_it_is_orphaned(start: Start) -> None:
     child = int(line(parent))
     try:
         parent.send_signal(signal.SIGKILL)
-        parent.wait(PATIENCE)
+        parent.wait(PATIENCE_S)
         assert not ended(child, 0.3)
     finally:
         os.kill(child, signal.SIGKILL)
@@ -108,9 +108,9 @@ def test_a_child_without_it_is_orphaned(start: Start) -> None:
 def test_a_child_whose_parent_is_dead_already_leaves_at_once(start: Start) -> None:
     """The parent died between the fork and the call: its id is no longer the one of the parent."""
     gone = start("pass")
-    gone.wait(PATIENCE)
+    gone.wait(PATIENCE_S)
     late = start(CHILD, str(gone.pid))
-    assert late.wait(PATIENCE) == FAILED
+    assert late.wait(PATIENCE_S) == FAILED
     assert late.stdout is not None
     assert late.stdout.read() == ""
 
@@ -131,7 +131,7 @@ def test_a_signal_is_only_noted_and_the_loop_leaves_in_order(number: signal.Sign
     assert line(child) == "ready"
     child.send_signal(number)
     assert line(child) == "leaving in order"
-    assert child.wait(PATIENCE) == DONE
+    assert child.wait(PATIENCE_S) == DONE
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -141,7 +141,7 @@ def test_a_second_signal_ends_the_process_at_once(number: signal.Signals, start:
     child.send_signal(signal.SIGTERM)
     assert line(child) == "leaving in order"
     child.send_signal(number)
-    assert child.wait(PATIENCE) == 128 + number
+    assert child.wait(PATIENCE_S) == 128 + number
 
 
 class UserError(ValueError):
@@ -183,7 +183,7 @@ def test_a_mistake_in_a_process_is_exit_code_2_without_a_traceback(start: Start)
         "sys.exit(run(lambda: build({'team.size': 0}) and 0, (ConfigError,)))"
     )
     child = start(code)
-    out, err = child.communicate(timeout=PATIENCE)
+    out, err = child.communicate(timeout=PATIENCE_S)
     assert (child.returncode, out) == (2, "")
     assert err == "overfly: team.size = 0 is out of range: choose 1 to 1,000\n"
 

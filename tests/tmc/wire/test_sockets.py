@@ -18,7 +18,7 @@ from tmc.wire.codec import CodecError, decode, encode
 from tmc.wire.messages import Ack, Hello, Message, Minibatch, PolicyRequest
 from tmc.wire.sockets import EndpointError
 
-PATIENCE = 100_000
+PATIENCE_MS = 100_000
 """Longest wait for a message, milliseconds."""
 Same = Callable[[Message, Message], bool]
 Sock = zmq.Socket[Any]
@@ -74,7 +74,7 @@ def ipc(short: Path) -> str:
 
 def wait(sock: Sock) -> list[Any]:
     """The frames of the next message."""
-    assert sock.poll(PATIENCE), "nothing came"
+    assert sock.poll(PATIENCE_MS), "nothing came"
     frames = sockets.receive(sock)
     assert frames is not None
     return frames
@@ -82,7 +82,7 @@ def wait(sock: Sock) -> list[Any]:
 
 def wait_message(sock: Sock) -> Message:
     """The next message of a client's socket."""
-    assert sock.poll(PATIENCE), "nothing came"
+    assert sock.poll(PATIENCE_MS), "nothing came"
     message = sockets.receive_message(sock)
     assert message is not None
     return message
@@ -161,7 +161,7 @@ def test_a_client_finds_the_tmc_again(radio: Radio, endpoint: str) -> None:
     meet(bound, client, b"uav-000")
     bound.close()
     again = None
-    deadline = time.monotonic() + PATIENCE / 1000
+    deadline = time.monotonic() + PATIENCE_MS / 1000
     while again is None:
         try:
             again = radio.router(endpoint)
@@ -247,7 +247,7 @@ def test_frames_that_are_no_message_do_not_break_the_socket(radio: Radio, ipc: s
     meet(bound, client, b"uav-000")
     for junk in ([b""], [b"\xc1"], [b"x"] * (sockets.PARTS + 1), [*encode(Ack(1)), b"more"], [b"\x80"] * 100):
         bound.send_multipart([b"uav-000", *junk])
-        assert client.poll(PATIENCE)
+        assert client.poll(PATIENCE_MS)
         with pytest.raises(CodecError):
             sockets.receive_message(client)
     meet(bound, client, b"uav-000")
@@ -257,7 +257,7 @@ def test_too_many_frames_are_counted_before_they_are_read(radio: Radio, ipc: str
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
     bound.send_multipart([b"uav-000", *encode(Ack(1)), *[b"x"] * sockets.PARTS])
-    assert client.poll(PATIENCE)
+    assert client.poll(PATIENCE_MS)
     with pytest.raises(CodecError, match=rf"{sockets.PARTS + 1} frames, at most {sockets.PARTS}"):
         sockets.receive_message(client)
 
@@ -269,7 +269,7 @@ def test_a_flood_and_a_hang_up_leave_the_tmc_standing(radio: Radio, endpoint: st
     with radio.stranger(endpoint, b"evil") as evil:
         for _ in range(900):
             evil.send(b"x" * 100, zmq.NOBLOCK)
-        assert bound.poll(PATIENCE)
+        assert bound.poll(PATIENCE_MS)
     assert sockets.send(client, PolicyRequest(8))
     while (frames := wait(bound))[0] == b"evil":  # as much of the flood as has come
         pass
@@ -400,7 +400,7 @@ def test_what_is_no_endpoint_cannot_be_connected_to(bad: str, radio: Radio) -> N
     ],
 )
 def test_the_learners_endpoint_stands_beside_that_of_the_uavs(sync: str, feed: str) -> None:
-    assert sockets.feed_endpoint(sync) == feed
+    assert sockets.learner_endpoint(sync) == feed
 
 
 @pytest.mark.parametrize(
@@ -414,7 +414,7 @@ def test_the_learners_endpoint_stands_beside_that_of_the_uavs(sync: str, feed: s
 )  # fmt: skip
 def test_no_endpoint_for_the_learner_is_refused(sync: str) -> None:
     with pytest.raises(EndpointError, match=r"is not an endpoint.*: write tcp://HOST:PORT or ipc://PATH") as caught:
-        sockets.feed_endpoint(sync)
+        sockets.learner_endpoint(sync)
     sentence(caught.value)
 
 
@@ -423,4 +423,4 @@ def test_a_free_port_and_its_successor_can_be_bound(radio: Radio) -> None:
     for _ in range(5):
         sync = f"tcp://127.0.0.1:{sockets.free_port()}"
         radio.router(sync)
-        radio.router(sockets.feed_endpoint(sync))
+        radio.router(sockets.learner_endpoint(sync))

@@ -7,23 +7,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tmc.analysis.invariants import flight, map, reward
-from tmc.analysis.invariants.episode_log import Evidence, Gathering
-from tmc.analysis.invariants.recompute import Truth, truth
-from tmc.analysis.invariants.result import Found, Violation
+from tmc.analysis.invariants.episode_log import EpisodeLog, Gathering
+from tmc.analysis.invariants.recompute import Reference, truth
+from tmc.analysis.invariants.result import InvariantResult, Violation
 from tmc.analysis.invariants.state import STATE, states
 from tmc.analysis.run_config import world_of
 from tmc.record.errors import RecordError
-from tmc.record.reader import Entry, Log, run_files
+from tmc.record.reader import Log, LogMessage, run_files
 
-Law = Callable[[Evidence, Truth], Found]
+Law = Callable[[EpisodeLog, Reference], InvariantResult]
 
 
-def _of_records(law: Callable[[Evidence], Found]) -> Law:
+def _of_records(law: Callable[[EpisodeLog], InvariantResult]) -> Law:
     return lambda e, _truth: law(e)
 
 
 INVARIANTS: tuple[tuple[str, str, Law], ...] = (
-    ("episodes", "begun and ended once, in order, nothing strange in them", _of_records(flight.episodes)),
+    ("episodes", "begun and ended once, in order, nothing anomalies in them", _of_records(flight.episodes)),
     ("starts", "cells at tick 0 with the draws of the seed", _of_records(flight.starts)),
     ("sequence", "numbers of a UAV's records, without gap or repeat", _of_records(flight.sequence)),
     ("ticks", "ticks of a UAV's records, without gap or repeat", _of_records(flight.ticks)),
@@ -57,7 +57,7 @@ class Row:
     facts: int = 0
     violation: Violation | None = None
 
-    def add(self, found: Found) -> None:
+    def add(self, found: InvariantResult) -> None:
         self.facts += found.facts
         self.violation = self.violation or found.violation
 
@@ -89,10 +89,10 @@ class Result:
     def summary(self) -> str:
         """All of it in one sentence."""
         broken, facts = sum(row.violation is not None for row in self.rows), sum(row.facts for row in self.rows)
-        verdict = f"{broken} of {len(self.rows)} invariants are violated" if broken else "all invariants hold"
+        conclusion = f"{broken} of {len(self.rows)} invariants are violated" if broken else "all invariants hold"
         open_ = f" ({self.unfinished} not finished)" if self.unfinished else ""
         count = f"{self.episodes} episode{'s' * (self.episodes != 1)}"
-        return f"{self.path}: {count}{open_}, {facts:,} facts, {verdict}{self.note}"
+        return f"{self.path}: {count}{open_}, {facts:,} facts, {conclusion}{self.note}"
 
 
 def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) -> Result:
@@ -109,7 +109,7 @@ def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) ->
     rows = [Row(name, compared) for name, compared, _ in INVARIANTS]
     result.rows += [*rows, state := Row(*STATE)]
     log = Log(path)
-    for e in Gathering(world).episodes(_sound(log, result.rows[0])):
+    for e in Gathering(world).episodes(_intact(log, result.rows[0])):
         reckoned = truth(e)
         for row, (_, _, law) in zip(rows, INVARIANTS, strict=True):
             row.add(law(e, reckoned))
@@ -117,14 +117,14 @@ def check(folder: Path, show: Callable[[str, float], None] = lambda *_: None) ->
         result.unfinished += not e.ended
         show(f"checked episode {e.number}", e.number / world.config.training.episodes)
     state.add(states(world, log, show))
-    _judge_file(log, result)
+    _check_file(log, result)
     result.note += "".join(f"; {note}" for note in notes)
     if not result.episodes:
         rows[0].violation = Violation(None, None, None, "there is none: nothing was flown, or nothing of it is left")
     return result
 
 
-def _sound(log: Log, row: Row) -> Iterator[Entry]:
+def _intact(log: Log, row: Row) -> Iterator[LogMessage]:
     """All messages of a journal; one that does not decode ends it."""
     try:
         for entry in log.entries():
@@ -134,7 +134,7 @@ def _sound(log: Log, row: Row) -> Iterator[Entry]:
         row.violation = Violation(None, None, None, str(error))
 
 
-def _judge_file(log: Log, result: Result) -> None:
+def _check_file(log: Log, result: Result) -> None:
     """Damage, and what is known to be lost; a journal that a kill cut off, or that still grows, is good as it is."""
     left = log.still_open
     lost = log.lost.get("lost")

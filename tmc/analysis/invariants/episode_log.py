@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tmc.kernel.world import World
 from tmc.record import builders
-from tmc.record.reader import Entry
+from tmc.record.reader import LogMessage
 
 UNKNOWN = -1
 """In arrays by tick and UAV: no record tells."""
@@ -68,12 +68,12 @@ class Before:
         return Before(dict(self.sequence), self.version, self.number)
 
 
-class Evidence:
+class EpisodeLog:
     """All that the journal says of one episode; T ticks, N UAVs, as the config has them.
 
     `cells`, `actions`, `blocks`: shape (T + 1, N), int64, UNKNOWN where no record tells; `own`: the rewards in records,
     shape (T + 1, N), float64, NaN there. A move is found at the tick at which it ends. `seen`: by UAV, the ticks and
-    cells of its sightings. `lost`: UAV, and the tick of its last record, as told and as it was then. `strange`: what
+    cells of its sightings. `lost`: UAV, and the tick of its last record, as told and as it was then. `anomalies`: what
     makes no sense: (tick, UAV, why).
     """
 
@@ -91,7 +91,7 @@ class Evidence:
         self.begins: list[Any] = []
         self.ends: list[Any] = []
         self.lost: list[tuple[int, int, int]] = []
-        self.strange: list[tuple[int | None, int | None, str]] = []
+        self.anomalies: list[tuple[int | None, int | None, str]] = []
         self.reported = [-1] * self.N
         self.last = True
         """Nothing follows in the journal: it may not be finished."""
@@ -111,9 +111,9 @@ class Gathering:
 
     def __init__(self, world: World) -> None:
         self.world, self.before = world, Before()
-        self.episode: Evidence | None = None
+        self.episode: EpisodeLog | None = None
 
-    def episodes(self, entries: Iterable[Entry]) -> Iterator[Evidence]:
+    def episodes(self, entries: Iterable[LogMessage]) -> Iterator[EpisodeLog]:
         """One after the other, as soon as the next one begins."""
         for entry in entries:
             name = entry.message.DESCRIPTOR.full_name
@@ -126,29 +126,31 @@ class Gathering:
         if self.episode is not None:
             yield self.episode
 
-    def _turn(self, number: int) -> Evidence | None:
+    def _turn(self, number: int) -> EpisodeLog | None:
         """Turn to the episode of a message; returns the one that is over with that."""
         done = self.episode
         if done is not None and number <= done.number:
             if number < done.number:
-                done.strange.append((None, None, f"a message of episode {number} stands among those of {done.number}"))
+                done.anomalies.append(
+                    (None, None, f"a message of episode {number} stands among those of {done.number}")
+                )
             return None
         if done is not None:
             done.last = False
             self.before.number = done.number
-        self.episode = Evidence(self.world, number, self.before.copy())
+        self.episode = EpisodeLog(self.world, number, self.before.copy())
         return done
 
-    def _lost(self, e: Evidence, m: Any) -> None:
+    def _lost(self, e: EpisodeLog, m: Any) -> None:
         if m.uav < e.N:
             e.lost.append((m.uav, m.tick, e.reported[m.uav]))
         else:
-            e.strange.append((None, m.uav, f"it is lost, and there is none of that number in a team of {e.N}"))
+            e.anomalies.append((None, m.uav, f"it is lost, and there is none of that number in a team of {e.N}"))
 
-    def _record(self, e: Evidence, m: Any) -> None:
-        strange = misfit(e, m)
-        if strange:
-            e.strange.append((m.tick, m.uav, strange))
+    def _record(self, e: EpisodeLog, m: Any) -> None:
+        anomalies = misfit(e, m)
+        if anomalies:
+            e.anomalies.append((m.tick, m.uav, anomalies))
             return
         before, i = self.before, m.uav
         answered = next((s.version for s in reversed(e.syncs) if i in s.uavs), e.before.version)
@@ -161,43 +163,43 @@ class Gathering:
         e.seen[i][0].extend(m.seen_tick[:])
         e.seen[i][1].extend(m.seen_cell[:])
 
-    def _sync(self, e: Evidence, m: Any) -> None:
+    def _sync(self, e: EpisodeLog, m: Any) -> None:
         e.syncs.append(
             Sync(m.tick, m.version, m.uavs[:], m.believed, list(e.reported), frozenset(i for i, *_ in e.lost))
         )
         self.before.version = m.version
 
-    def _grid(self, e: Evidence, m: Any) -> None:
+    def _grid(self, e: EpisodeLog, m: Any) -> None:
         if not e.syncs or e.syncs[-1].last_visit is not None:
-            e.strange.append((None, None, "a map stands behind no exchange"))
+            e.anomalies.append((None, None, "a map stands behind no exchange"))
             return
         grid = self.world.grid
         strides = (m.column_count, m.row_stride) == (grid.cols, grid.cols * m.cell_stride)
         if not strides or len(m.data) != grid.size * m.cell_stride:
-            e.strange.append((e.syncs[-1].tick, None, f"a map is not of {grid.rows} x {grid.cols} cells"))
+            e.anomalies.append((e.syncs[-1].tick, None, f"a map is not of {grid.rows} x {grid.cols} cells"))
             return
         e.syncs[-1].last_visit = builders.last_visit(m)
 
-    def _metrics(self, e: Evidence, m: Any) -> None:
+    def _metrics(self, e: EpisodeLog, m: Any) -> None:
         e.metrics.append(Metrics(m.first, m.steps, m.uncertainty[:], m.reward[:]))
 
-    def _events(self, e: Evidence, m: Any) -> None:
+    def _events(self, e: EpisodeLog, m: Any) -> None:
         e.events += zip(m.ticks[:], m.cells[:], strict=False)
         if len(m.ticks) != len(m.cells):
-            e.strange.append((None, None, f"{len(m.ticks)} ticks of events have {len(m.cells)} cells"))
+            e.anomalies.append((None, None, f"{len(m.ticks)} ticks of events have {len(m.cells)} cells"))
 
-    def _episode(self, e: Evidence, m: Any) -> None:
+    def _episode(self, e: EpisodeLog, m: Any) -> None:
         (e.ends if m.phase == "end" else e.begins).append(m)
 
 
-def misfit(e: Evidence, m: Any) -> str:
+def misfit(e: EpisodeLog, m: Any) -> str:
     """Why a flight record cannot be put where it says; empty when it can."""
     moves, size = m.tick - max(m.first, 1) + 1, e.world.grid.size
     if m.uav >= e.N:
         return f"there is no UAV {m.uav} in a team of {e.N}"
     if not m.first <= m.tick <= e.T:
         return f"ticks {m.first}..{m.tick} are none of an episode of {e.T}"
-    valued = bool(e.world.config.replay.priority) and e.world.config.team.pilot == "policy"
+    valued = bool(e.world.config.replay.priority_exponent) and e.world.config.team.controller == "policy"
     lengths = [len(m.cells), len(m.actions), len(m.blocks), len(m.rewards), len(m.seen_tick), len(m.values)]
     if lengths != [m.tick - m.first + 1, moves, moves, moves, len(m.seen_cell), 2 * moves * valued]:
         return "its arrays do not match its ticks"
@@ -208,7 +210,7 @@ def misfit(e: Evidence, m: Any) -> str:
     return ""
 
 
-_TAKERS: dict[str, Callable[[Gathering, Evidence, Any], None]] = {
+_TAKERS: dict[str, Callable[[Gathering, EpisodeLog, Any], None]] = {
     "overfly.FlightRecord": Gathering._record,
     "overfly.Lost": Gathering._lost,
     "overfly.Sync": Gathering._sync,

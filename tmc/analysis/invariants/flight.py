@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.analysis.invariants.episode_log import UNKNOWN, Evidence
-from tmc.analysis.invariants.result import Found, judged, places
+from tmc.analysis.invariants.episode_log import UNKNOWN, EpisodeLog
+from tmc.analysis.invariants.result import InvariantResult, first_violation, places
 from tmc.kernel.grid import ACTIONS, STAY
 from tmc.kernel.reward import Block
 
@@ -17,9 +17,9 @@ Ints = NDArray[np.int64]
 Fault = tuple[int | None, int | None, str]
 
 
-def episodes(e: Evidence) -> Found:
-    """Episodes follow one another from 1, each begun and, but for the last, ended once; nothing strange in them."""
-    faults: list[Fault] = list(e.strange)
+def episodes(e: EpisodeLog) -> InvariantResult:
+    """Episodes follow one another from 1, each begun and, but for the last, ended once; nothing anomalies in them."""
+    faults: list[Fault] = list(e.anomalies)
     if e.number != e.before.number + 1:
         faults.append((None, None, f"it follows episode {e.before.number}"))
     if not e.begins or any(m != e.begins[0] for m in e.begins):
@@ -27,15 +27,15 @@ def episodes(e: Evidence) -> Found:
     if len(e.ends) > 1 or not (e.ends or e.last):
         faults.append((None, None, f"{len(e.ends)} messages end it"))
     faults += [(None, None, "its begin has sums of what was not flown yet") for m in e.begins if not _fresh(e, m)]
-    return judged(e, len(e.begins) + len(e.ends), faults)
+    return first_violation(e, len(e.begins) + len(e.ends), faults)
 
 
-def _fresh(e: Evidence, m: Any) -> bool:
+def _fresh(e: EpisodeLog, m: Any) -> bool:
     sums = (m.ticks, m.uncertainty, m.uncertainty_per_cell, m.blocked_grid, m.blocked_obstacle, m.blocked_uav)
     return not any(sums) and list(m.reward) == [0.0] * e.N
 
 
-def starts(e: Evidence) -> Found:
+def starts(e: EpisodeLog) -> InvariantResult:
     """The cells at tick 0, and those of the begin of the episode, are the draws of the seed."""
     drawn = e.world.starts(e.number)
     told = [list(m.starts) for m in (*e.begins, *e.ends)]
@@ -45,10 +45,10 @@ def starts(e: Evidence) -> Found:
     here = e.cells[0] != UNKNOWN
     wrong = np.flatnonzero(here & (e.cells[0] != drawn))
     faults += [(0, int(i), f"it starts on cell {e.cells[0, i]}, the seed draws {drawn[i]}") for i in wrong]
-    return judged(e, int(here.sum()) + len(told), faults)
+    return first_violation(e, int(here.sum()) + len(told), faults)
 
 
-def sequence(e: Evidence) -> Found:
+def sequence(e: EpisodeLog) -> InvariantResult:
     """The numbers of a UAV's records go up by one, over all episodes."""
     following, faults = dict(e.before.sequence), []
     for r in e.records:
@@ -56,10 +56,10 @@ def sequence(e: Evidence) -> Found:
         if r.sequence != wanted:
             faults.append((r.tick, r.uav, f"record {r.sequence} stands where {wanted} is next"))
         following[r.uav] = r.sequence + 1
-    return judged(e, len(e.records), faults)
+    return first_violation(e, len(e.records), faults)
 
 
-def ticks(e: Evidence) -> Found:
+def ticks(e: EpisodeLog) -> InvariantResult:
     """A UAV's records follow one another without a tick between or twice."""
     reported, faults = [-1] * e.N, []
     for r in e.records:
@@ -68,10 +68,10 @@ def ticks(e: Evidence) -> Found:
                 (r.first, r.uav, f"a record begins at tick {r.first}, the one before ends at {reported[r.uav]}")
             )
         reported[r.uav] = r.tick
-    return judged(e, len(e.records), faults)
+    return first_violation(e, len(e.records), faults)
 
 
-def cadence(e: Evidence) -> Found:
+def cadence(e: EpisodeLog) -> InvariantResult:
     """Every record ends at the first tick at which its UAV is due, and holds no such tick before."""
     config = e.world.config
     faults: list[Fault] = []
@@ -79,10 +79,10 @@ def cadence(e: Evidence) -> Found:
         due = next((t for t in range(r.first, e.T + 1) if config.due(r.uav, t)), e.T)
         if r.tick != due:
             faults.append((r.tick, r.uav, f"a record ends at tick {r.tick}, it is due at {due}"))
-    return judged(e, len(e.records), faults)
+    return first_violation(e, len(e.records), faults)
 
 
-def lost(e: Evidence) -> Found:
+def lost(e: EpisodeLog) -> InvariantResult:
     """A UAV is lost once, after its last record; and whoever's records do not reach the episode's end is lost."""
     faults: list[Fault] = []
     told = [i for i, *_ in e.lost]
@@ -93,10 +93,10 @@ def lost(e: Evidence) -> Found:
             faults.append((tick, i, "it is lost twice"))
     missing = [i for i in range(e.N) if e.reported[i] < e.T and i not in told]
     faults += [(e.reported[i], i, "its records end here, and it was not lost") for i in missing if e.ended]
-    return judged(e, e.N, faults)
+    return first_violation(e, e.N, faults)
 
 
-def moves(e: Evidence) -> Found:
+def moves(e: EpisodeLog) -> InvariantResult:
     """Each cell follows from the one before by the action, or is the same where the move was blocked; edges, obstacles
     and no-fly cells block, and nothing else but a UAV does."""
     before, after, action, block = e.cells[:-1], e.cells[1:], e.actions[1:], e.blocks[1:]
@@ -113,15 +113,15 @@ def moves(e: Evidence) -> Found:
                for t, i in places(untrue)]  # fmt: skip
     faults += [(t + 1, i, "another UAV is said to keep it from staying") for t, i in places(held_by_itself)]
     faults += [(t, i, f"it stands on the obstacle of cell {e.cells[t, i]}") for t, i in places(on_obstacle)]
-    return judged(e, int(known.sum()), faults)
+    return first_violation(e, int(known.sum()), faults)
 
 
-def _said(e: Evidence, t: int, i: int) -> str:
+def _said(e: EpisodeLog, t: int, i: int) -> str:
     action, block = e.actions[t + 1, i], Block(max(e.blocks[t + 1, i], 0))
     return f"action {ACTIONS[action][0]}" + (f", blocked by {block.name.lower()}" if block else "")
 
 
-def _static(e: Evidence, before: Ints, action: Ints) -> tuple[Ints, Ints]:
+def _static(e: EpisodeLog, before: Ints, action: Ints) -> tuple[Ints, Ints]:
     """Where the actions lead (UNKNOWN: off the grid), and what the map says of that; by rows and columns."""
     grid, steps = e.world.grid, np.array([(dr, dc) for _, dr, dc in ACTIONS])
     rows = before // grid.cols + steps[action, 0]
@@ -132,7 +132,7 @@ def _static(e: Evidence, before: Ints, action: Ints) -> tuple[Ints, Ints]:
     return target, np.where(inside, obstacle, Block.GRID)
 
 
-def blocks(e: Evidence) -> Found:
+def blocks(e: EpisodeLog) -> InvariantResult:
     """A UAV blocks a move just when it holds the target: one of a lower id at the new tick, a higher at the old."""
     before, action, block = e.cells[:-1], e.actions[1:], e.blocks[1:]
     target, static = _static(e, before, action)
@@ -147,10 +147,10 @@ def blocks(e: Evidence) -> Found:
             wrong = np.flatnonzero(bad & free[:, i])
             said = "blocked by a UAV" if what == "nobody holds" else "not blocked"
             faults += [(int(t) + 1, i, f"{said}, but {what} cell {target[t, i]}") for t in wrong[:1]]
-    return judged(e, int(free.sum()), faults)
+    return first_violation(e, int(free.sum()), faults)
 
 
-def separation(e: Evidence) -> Found:
+def separation(e: EpisodeLog) -> InvariantResult:
     """No two UAVs are on one cell at one tick."""
     order = np.sort(e.cells, axis=1)
     shared = (np.diff(order, axis=1) == 0) & (order[:, 1:] != UNKNOWN)
@@ -159,10 +159,10 @@ def separation(e: Evidence) -> Found:
         cell = order[t, 1:][shared[t]][0]
         uavs = np.flatnonzero(e.cells[t] == cell).tolist()
         faults.append((t, uavs[0], f"UAVs {uavs} are on cell {cell}"))
-    return judged(e, int((e.cells != UNKNOWN).sum()), faults)
+    return first_violation(e, int((e.cells != UNKNOWN).sum()), faults)
 
 
-def sightings(e: Evidence) -> Found:
+def sightings(e: EpisodeLog) -> InvariantResult:
     """A UAV saw those that were within its sensing range, tick by tick; in scenario I everybody sees everybody."""
     faults: list[Fault] = []
     facts = 0
@@ -172,10 +172,10 @@ def sightings(e: Evidence) -> Found:
         facts += there.shape[1]
         if not np.array_equal(seen, there):
             faults += list(_unseen(e, i, seen, there))
-    return judged(e, facts, faults)
+    return first_violation(e, facts, faults)
 
 
-def _near(e: Evidence, i: int) -> Ints:
+def _near(e: EpisodeLog, i: int) -> Ints:
     """(2, S): ticks, and cells of the others within UAV i's range, by tick and id."""
     cols, reach = e.world.grid.cols, e.world.config.team.sensing_range
     dr = e.cells // cols - (e.cells[:, [i]] // cols)
@@ -187,7 +187,7 @@ def _near(e: Evidence, i: int) -> Ints:
     return np.stack((ticks, e.cells[ticks, uavs]))
 
 
-def _unseen(e: Evidence, i: int, seen: Ints, there: Ints) -> Iterator[Fault]:
+def _unseen(e: EpisodeLog, i: int, seen: Ints, there: Ints) -> Iterator[Fault]:
     """What differs, tick by tick; where UAVs are lost, one may have been seen of whom no record tells."""
     for t in np.unique(np.concatenate((seen[0], there[0]))).tolist():
         saw, could = seen[1, seen[0] == t].tolist(), there[1, there[0] == t].tolist()

@@ -6,16 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from tmc.analysis.invariants.episode_log import UNKNOWN, Evidence
+from tmc.analysis.invariants.episode_log import UNKNOWN, EpisodeLog
 from tmc.analysis.invariants.flight import Fault
-from tmc.analysis.invariants.recompute import Truth, accounts, law_of, maps_handed_out, start_factor, uncertainty
-from tmc.analysis.invariants.result import Found, close, judged
+from tmc.analysis.invariants.recompute import Reference, accounts, law_of, maps_handed_out, start_factor, uncertainty
+from tmc.analysis.invariants.result import InvariantResult, close, first_violation
 
 EXACT = 1e-6
 """Sums of the journal and of the reckoning are equal up to this, relative where they are above 1."""
 
 
-def exchanges(e: Evidence, _truth: Truth) -> Found:
+def exchanges(e: EpisodeLog, _truth: Reference) -> InvariantResult:
     """At each tick at which UAVs are due, once their records are in, one exchange answers these and nobody else."""
     held = [s.tick for s in e.syncs]
     faults: list[Fault] = [(b, None, f"an exchange at tick {b} follows one at {a}")
@@ -26,17 +26,17 @@ def exchanges(e: Evidence, _truth: Truth) -> Found:
             faults.append((s.tick, None, f"UAVs {s.uavs} are answered, {due} are due"))
         faults += [(s.tick, i, "its record is not waited for") for i in due if s.reported[i] < s.tick]
     faults += [(t, None, "no exchange is held, and UAVs were due") for t in _needed(e) - set(held)]
-    return judged(e, len(e.syncs), faults)
+    return first_violation(e, len(e.syncs), faults)
 
 
-def _needed(e: Evidence) -> set[int]:
+def _needed(e: EpisodeLog) -> set[int]:
     """Ticks of exchanges that must have been held: some UAV has flown on from there, or the episode is over."""
     lost, config = {i for i, *_ in e.lost}, e.world.config
     upto = [e.T + 1 if e.ended and i not in lost else max(e.reported[i], 0) for i in range(e.N)]
     return {t for i in range(e.N) for t in range(upto[i]) if config.due(i, t)}
 
 
-def versions(e: Evidence, _truth: Truth) -> Found:
+def versions(e: EpisodeLog, _truth: Reference) -> InvariantResult:
     """Map versions rise by one an exchange, over all episodes; each record names one that its UAV was given."""
     version = e.before.version
     faults: list[Fault] = []
@@ -47,13 +47,13 @@ def versions(e: Evidence, _truth: Truth) -> Found:
         version = s.version
     faults += [(r.tick, r.uav, f"it flew by map {r.version}, it was given {r.given}")
                for r in e.records if r.version != r.given]  # fmt: skip
-    return judged(e, len(e.syncs) + len(e.records), faults)
+    return first_violation(e, len(e.syncs) + len(e.records), faults)
 
 
-def maps(e: Evidence, _truth: Truth) -> Found:
+def maps(e: EpisodeLog, _truth: Reference) -> InvariantResult:
     """Scenario II: each exchange hands out the latest visits of all records up to its tick, cell by cell."""
     if e.world.config.scenario == 1:
-        return judged(e, 0, [(s.tick, None, "a map of visits stands in scenario I") for s in e.syncs
+        return first_violation(e, 0, [(s.tick, None, "a map of visits stands in scenario I") for s in e.syncs
                              if s.last_visit is not None])  # fmt: skip
     faults: list[Fault] = []
     for s, expected in zip(e.syncs, maps_handed_out(e), strict=True):
@@ -63,10 +63,10 @@ def maps(e: Evidence, _truth: Truth) -> Found:
             continue
         for k in np.flatnonzero(s.last_visit != expected)[:1].tolist():
             faults.append((s.tick, None, f"cell {k} was visited at tick {expected[k]}, not {s.last_visit[k]}"))
-    return judged(e, sum(s.last_visit is not None for s in e.syncs) * e.world.grid.size, faults)
+    return first_violation(e, sum(s.last_visit is not None for s in e.syncs) * e.world.grid.size, faults)
 
 
-def believed(e: Evidence, truth: Truth) -> Found:
+def believed(e: EpisodeLog, truth: Reference) -> InvariantResult:
     """An exchange says how uncertain its map is, summed over cells; in scenario I, how many events are on."""
     law, start = law_of(e.world), start_factor(e)
     if e.world.config.scenario == 1:
@@ -76,10 +76,10 @@ def believed(e: Evidence, truth: Truth) -> Found:
                   for s, m in zip(e.syncs, maps_handed_out(e), strict=True)]  # fmt: skip
     wrong = ((s, v) for s, v in zip(e.syncs, values, strict=True) if not close(s.believed, v, EXACT))
     faults = ((s.tick, None, f"{s.believed:.9g} is logged, the map makes {v:.9g}") for s, v in wrong)
-    return judged(e, len(e.syncs), faults)
+    return first_violation(e, len(e.syncs), faults)
 
 
-def events(e: Evidence, truth: Truth) -> Found:
+def events(e: EpisodeLog, truth: Reference) -> InvariantResult:
     """Scenario I: the events that appear are the draws of the seed, where no event was on; none in scenario II."""
     upto = e.settled()
     if not e.ended and e.metrics and all(t < e.metrics[-1].first for t, _ in e.events):
@@ -90,10 +90,10 @@ def events(e: Evidence, truth: Truth) -> Found:
     faults += [(t, None, f"an event in cell {k} was drawn, and is not logged") for t, k in drawn - logged]
     if len(logged) < len(e.events):
         faults.append((None, None, f"{len(e.events) - len(logged)} events are logged twice"))
-    return judged(e, len(drawn), faults)
+    return first_violation(e, len(drawn), faults)
 
 
-def series(e: Evidence, truth: Truth) -> Found:
+def series(e: EpisodeLog, truth: Reference) -> InvariantResult:
     """The uncertainty by tick, summed over cells, follows from the visits; each tick is told once, in order."""
     faults, following, facts = list[Fault](), 0, 0
     for m in e.metrics:
@@ -110,14 +110,14 @@ def series(e: Evidence, truth: Truth) -> Found:
             faults.append((m.first, None, f"{m.steps} steps are logged, {e.begins[0].steps + flown} were flown"))
     missing = following <= e.T and e.ended
     faults += [(following, None, "the uncertainty from here on is missing")] if missing else []
-    return judged(e, facts, faults)
+    return first_violation(e, facts, faults)
 
 
-def accounting(e: Evidence, truth: Truth) -> Found:
+def accounting(e: EpisodeLog, truth: Reference) -> InvariantResult:
     """Scenario II: by cell, uncertainty summed over ticks is what it had been without visits, less what each took away;
     and the sum of all cells is that of the log."""
     if e.world.config.scenario == 1 or not e.ended:
-        return Found(0)
+        return InvariantResult(0)
     left, right = accounts(e, truth.found)
     cells = law_of(e.world).cells
     faults: list[Fault] = [(None, None, f"cell {cells[k]} adds up to {left[k]:.9g}, by its visits to {right[k]:.9g}")
@@ -127,4 +127,4 @@ def accounting(e: Evidence, truth: Truth) -> Found:
     if not abs(total - right.sum()) <= EXACT + 1e-12 * abs(total):
         faults.append((None, None, f"the log adds up to {total:.9g}, by its visits to {right.sum():.9g}"))
     visits = int((e.cells[1:] != UNKNOWN).sum())
-    return judged(e, cells.size + visits, faults)
+    return first_violation(e, cells.size + visits, faults)

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.analysis.invariants.episode_log import UNKNOWN, Evidence
+from tmc.analysis.invariants.episode_log import UNKNOWN, EpisodeLog
 from tmc.kernel.world import World
 
 Floats = NDArray[np.float64]
@@ -40,7 +40,7 @@ def law_of(world: World) -> Law:
     return Law(cells, place.tolist(), alpha, config.reward.weight * scale)
 
 
-def start_factor(e: Evidence) -> Floats:
+def start_factor(e: EpisodeLog) -> Floats:
     """(R,): what is left of certainty at t = 0, 1 - u_k(0)."""
     factor = e.world.initial_factor(e.number)
     return np.ones(law_of(e.world).cells.size) if factor is None else factor
@@ -52,7 +52,7 @@ def uncertainty(law: Law, start: Floats, last_visit: Ints, t: int) -> Floats:
 
 
 @dataclass(frozen=True)
-class Truth:
+class Reference:
     """The true map over an episode, entry by tick 0..T: sum over cells, rewards (T + 1, N), new events of each tick.
 
     `active`: scenario I, (T + 1, K), the events that are on; `found`: (T + 1, N), uncertainty of the cell that a UAV
@@ -66,12 +66,12 @@ class Truth:
     active: NDArray[np.bool_]
 
 
-def truth(e: Evidence) -> Truth:
+def truth(e: EpisodeLog) -> Reference:
     """Fly the episode again over the true map."""
     return _truth_1(e) if e.world.config.scenario == 1 else _truth_2(e)
 
 
-def _truth_2(e: Evidence) -> Truth:
+def _truth_2(e: EpisodeLog) -> Reference:
     law, start = law_of(e.world), start_factor(e)
     last, total, found = np.zeros(law.cells.size, np.int64), np.zeros(e.T + 1), np.zeros((e.T + 1, e.N))
     place = np.append(law.place, -1)
@@ -82,10 +82,10 @@ def _truth_2(e: Evidence) -> Truth:
         found[t, monitored] = uncertainty(law, start, last, t)[visited]
         last[visited] = t
         total[t] = uncertainty(law, start, last, t).sum()
-    return Truth(total, rewards(e, found), found, [], np.zeros((0, 0), bool))
+    return Reference(total, rewards(e, found), found, [], np.zeros((0, 0), bool))
 
 
-def _truth_1(e: Evidence) -> Truth:
+def _truth_1(e: EpisodeLog) -> Reference:
     K = e.world.grid.size
     active, total, found = np.zeros((e.T + 1, K), bool), np.zeros(e.T + 1), np.zeros((e.T + 1, e.N))
     events: list[list[int]] = [[]]
@@ -99,10 +99,10 @@ def _truth_1(e: Evidence) -> Truth:
         active[t] = left | new
         total[t] = active[t].sum()
         events.append(np.flatnonzero(new).tolist())
-    return Truth(total, rewards(e, found), found, events, active)
+    return Reference(total, rewards(e, found), found, events, active)
 
 
-def rewards(e: Evidence, found: Floats) -> Floats:
+def rewards(e: EpisodeLog, found: Floats) -> Floats:
     """(T + 1, N): eq. (13) by the true map, or with the UAVs' own reckoning where the config says so."""
     rules, place = e.world.config.reward, law_of(e.world).place
     weight = [*law_of(e.world).weight.tolist(), 0.0]
@@ -125,7 +125,7 @@ def rewards(e: Evidence, found: Floats) -> Floats:
     return out
 
 
-def maps_handed_out(e: Evidence) -> list[Ints]:
+def maps_handed_out(e: EpisodeLog) -> list[Ints]:
     """For each exchange the map that its tick and its UAVs make, (K,): ticks of the last visits that the TMC knows."""
     believed, known = np.zeros(e.world.grid.size, np.int64), [-1] * e.N
     monitored = e.world.alpha > 0
@@ -140,7 +140,7 @@ def maps_handed_out(e: Evidence) -> list[Ints]:
     return maps
 
 
-def own_rewards(e: Evidence, i: int, maps: list[Ints], active: NDArray[np.bool_]) -> Floats:
+def own_rewards(e: EpisodeLog, i: int, maps: list[Ints], active: NDArray[np.bool_]) -> Floats:
     """(T + 1,): UAV i's reward by its own map, from where it was, what it saw and the maps that it was given; NaN where
     it did not move."""
     config, law, start = e.world.config, law_of(e.world), start_factor(e)
@@ -170,7 +170,7 @@ def own_rewards(e: Evidence, i: int, maps: list[Ints], active: NDArray[np.bool_]
     return out
 
 
-def accounts(e: Evidence, found: Floats) -> tuple[Floats, Floats]:
+def accounts(e: EpisodeLog, found: Floats) -> tuple[Floats, Floats]:
     """The accounting identity of the log, both sides by cell, (R,): the sum over ticks 1..T of the uncertainty.
 
     Left: tick by tick, u(t + 1) = 1 - q + q u(t), and 0 at a visit. Right: the sum had nobody come, less what each

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.analysis.invariants.episode_log import Evidence
+from tmc.analysis.invariants.episode_log import EpisodeLog
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class Violation:
 
 
 @dataclass(frozen=True)
-class Found:
+class InvariantResult:
     """Facts compared, and the first violation among them."""
 
     facts: int
     violation: Violation | None = None
 
 
-def judged(e: Evidence, facts: int, faults: Iterable[tuple[int | None, int | None, str]]) -> Found:
+def first_violation(e: EpisodeLog, facts: int, faults: Iterable[tuple[int | None, int | None, str]]) -> InvariantResult:
     """The first of the faults (tick, UAV, what), by tick."""
     first = min(faults, key=lambda f: (f[0] is not None, f[0] or 0, f[1] or 0), default=None)
-    return Found(facts, Violation(e.number, *first) if first else None)
+    return InvariantResult(facts, Violation(e.number, *first) if first else None)
 
 
 def places(bad: NDArray[np.bool_]) -> list[tuple[int, int]]:

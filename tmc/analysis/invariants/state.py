@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tmc.analysis.invariants.result import Found, Violation
+from tmc.analysis.invariants.result import InvariantResult, Violation
 from tmc.center import recovery
-from tmc.center.entries import Entry
+from tmc.center.entries import JournalEntry
 from tmc.center.station import Station
 from tmc.kernel.world import World
 from tmc.record.errors import RecordError
@@ -19,11 +19,11 @@ _DIGESTS = {"map": "the maps are others", "replay": "the replay memory is anothe
             "transitions": "it holds another number of transitions"}  # fmt: skip
 
 
-def states(world: World, log: Log, show: Callable[[str, float], None]) -> Found:
+def states(world: World, log: Log, show: Callable[[str, float], None]) -> InvariantResult:
     """At the end of each episode the digests in the journal are those that playing it gives."""
     made: dict[int, dict[str, Any]] = {}
 
-    def watch(entries: list[Entry]) -> None:
+    def watch(entries: list[JournalEntry]) -> None:
         for entry in entries:
             if entry.topic == "/tmc/state":
                 number = entry.values["episode"]
@@ -38,4 +38,4 @@ def states(world: World, log: Log, show: Callable[[str, float], None]) -> Found:
     told = [entry.message for entry in log.entries(("/tmc/state",))]
     faults = (Violation(s.episode, None, None, what) for s in told if s.episode in made
               for name, what in _DIGESTS.items() if getattr(s, name) != made[s.episode][name])  # fmt: skip
-    return Found(len(_DIGESTS) * sum(s.episode in made for s in told), next(faults, violation))
+    return InvariantResult(len(_DIGESTS) * sum(s.episode in made for s in told), next(faults, violation))

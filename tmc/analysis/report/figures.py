@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tmc.analysis.report import style
 from tmc.analysis.report.map_figures import map_picture, paths_picture
-from tmc.analysis.run_data import Episode, Flown, Learning
+from tmc.analysis.run_data import Episode, Learning, RunData
 from tmc.analysis.summary import Mission, Summary
 
 __all__ = ["curves_picture", "map_picture", "paths_picture", "pictures", "uncertainty_picture"]
@@ -23,7 +23,7 @@ POINTS = 2000
 
 
 def pictures(
-    flown: Flown, summary: Summary, episode: int | None = None, baselines: Mapping[str, float] | None = None
+    flown: RunData, summary: Summary, episode: int | None = None, baselines: Mapping[str, float] | None = None
 ) -> dict[Path, Callable[[], Path]]:
     """The pictures of a run: each one's path, and what makes it.
 
@@ -45,7 +45,7 @@ def pictures(
 
 
 @style.own_settings()
-def curves_picture(flown: Flown, summary: Summary, path: Path, baselines: Mapping[str, float]) -> Path:
+def curves_picture(flown: RunData, summary: Summary, path: Path, baselines: Mapping[str, float]) -> Path:
     """Four curves of training: three by episode, one by updates."""
     made = style.figure(11, 7.5)
     ((top, reward), (blocked, learning)) = made.subplots(2, 2)
@@ -147,7 +147,7 @@ def _thin(values: NDArray[Any]) -> NDArray[Any]:
 
 
 @style.own_settings()
-def uncertainty_picture(flown: Flown, summary: Summary, shown: Episode, path: Path) -> Path:
+def uncertainty_picture(flown: RunData, summary: Summary, shown: Episode, path: Path) -> Path:
     """The sum over cells by tick of one episode, other episodes in grey, with its mean and the bound."""
     made = style.figure(9, 4.8)
     axes, m = made.add_subplot(), summary.mission

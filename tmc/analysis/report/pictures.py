@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tmc.analysis.run_data import Flown
+from tmc.analysis.run_data import RunData
 from tmc.analysis.summary import Summary
 from tmc.kernel.roadmap import RoadMap
 
@@ -26,7 +26,7 @@ class PictureError(Exception):
 
 
 def draw(
-    flown: Flown,
+    flown: RunData,
     summary: Summary,
     episode: int | None,
     baselines: Mapping[str, float],

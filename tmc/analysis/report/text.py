@@ -95,7 +95,7 @@ def _facts(s: Summary) -> Iterator[str]:
         loss = "" if p.loss is None else f"; last loss {p.loss:.3g}"
         yield _row("Learning", f"{p.updates:,} updates, {p.updates_per_second:,.0f} a second{loss}")
     yield _row("Processes", _processes(s))
-    yield _row("Log", f"{_size(h.log_bytes)} in {_count(len(h.log_files), 'file')}" + ("" if h.notes else ", sound"))
+    yield _row("Log", f"{_size(h.log_bytes)} in {_count(len(h.log_files), 'file')}" + ("" if h.notes else ", intact"))
 
 
 def _events(f: EpisodeFacts) -> str:

@@ -23,7 +23,7 @@ def layout(topics: Collection[str], colours: Sequence[str], rows: int, cols: int
     height = MARGIN * max(rows, cols) * cell_m
     values = {"<x>": cols * cell_m / 2, "<y>": rows * cell_m / 2, "<height>": height, "<cell>": cell_m}
     uavs = [{"<id>": str(i), "<colour>": colour, "<first>": i == 0} for i, colour in enumerate(colours)]
-    template = json.loads(files("tmc.record").joinpath(FILE).read_text("utf-8"))
+    template = json.loads(files("tmc.analysis.viewer").joinpath(FILE).read_text("utf-8"))
     return dict(_kept(_filled(template, values, uavs), topics))
 
 

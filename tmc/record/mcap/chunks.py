@@ -1,4 +1,4 @@
-"""The messages of one sound chunk, by what the chunks before it have told: schemas, channels, numbers."""
+"""The messages of one intact chunk, by what the chunks before it have told: schemas, channels, numbers."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _AGO = 1 << 31
 """Half of the 32 bits in which messages are numbered: a number farther ahead than that lies behind."""
 
 
-class UnsoundError(Exception):
-    """A record that is not sound: why."""
+class DamagedChunkError(Exception):
+    """A record that is not intact: why."""
 
 
 @dataclass
-class Known:
+class ChannelTable:
     """Schemas and channels by id, and the next number of each channel."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -39,13 +39,13 @@ class Known:
         known: dict[int, Any] = self.schemas if opcode == Opcode.SCHEMA else self.channels
         record = (Schema if opcode == Opcode.SCHEMA else Channel).read(ReadDataStream(BytesIO(body)))
         if known.setdefault(record.id, record) != record:
-            raise UnsoundError("its descriptions contradict those before")
+            raise DamagedChunkError("its descriptions contradict those before")
 
 
 class ChunkReader:
     """The messages of one chunk; `numbered`: their numbers must go up, from `first` on (None: from any)."""
 
-    def __init__(self, known: Known, numbered: bool, first: int | None) -> None:
+    def __init__(self, known: ChannelTable, numbered: bool, first: int | None) -> None:
         self.known, self.numbered, self.first = known, numbered, first
         self.missing = self.nameless = 0
 
@@ -67,7 +67,7 @@ class ChunkReader:
             first = sequence if self.first is None else self.first
             gap = (sequence - self.known.next.get(number, first)) & 0xFFFF_FFFF
             if gap >= _AGO:
-                raise UnsoundError("its messages were read before")
+                raise DamagedChunkError("its messages were read before")
             self.missing += gap
             self.known.next[number] = (sequence + 1) & 0xFFFF_FFFF
         channel = self.known.channels.get(number)

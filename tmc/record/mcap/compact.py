@@ -1,4 +1,4 @@
-"""Rewrites the logs of a run for keeping, in large chunks and under their finished names: `overfly log seal`."""
+"""Rewrites the logs of a run for keeping, in large chunks and under their finished names: `overfly log compact`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NUMBERS = struct.Struct("<QQIQ")
 
 
 @dataclass(frozen=True)
-class Sealed:
+class Compacted:
     """One file: its size before and after; `dropped`, the bytes of the torn end that a kill had left."""
 
     path: Path
@@ -34,26 +34,26 @@ class Sealed:
 
 @dataclass(frozen=True)
 class Survey:
-    """A file to seal: what was found in it, and digests of its messages and of all else."""
+    """A file to compact: what was found in it, and digests of its messages and of all else."""
 
     path: Path
     found: Findings
     digests: tuple[bytes, bytes]
 
 
-def seal_log(path: Path, show: Show = unseen) -> Sealed:
-    """Seal one log, as `seal_run` does."""
+def compact_log(path: Path, show: Show = unseen) -> Compacted:
+    """Seal one log, as `compact_run` does."""
     with closing(held(path)):
-        return _seal(_survey(path, show), show)
+        return _compact(_survey(path, show), show)
 
 
-def seal_run(folder: Path, show: Show = unseen) -> list[Sealed]:
+def compact_run(folder: Path, show: Show = unseen) -> list[Compacted]:
     """Seal all logs of a run. RecordError, and nothing is changed, when one is still written or is damaged."""
     paths = list(run_files(folder).values())
     with ExitStack() as stack:
         for path in paths:
             stack.enter_context(closing(held(path)))
-        return [_seal(survey, show) for survey in [_survey(path, show) for path in paths]]
+        return [_compact(survey, show) for survey in [_survey(path, show) for path in paths]]
 
 
 def _survey(path: Path, show: Show) -> Survey:
@@ -63,22 +63,22 @@ def _survey(path: Path, show: Show) -> Survey:
     torn = len(found.lost) == 1 and found.lost[0].why == CUT and path.suffix != ".mcap"
     if not (found.whole or torn) or found.notes:
         what = "; ".join([*map(str, found.lost), *found.notes]) or "messages are missing"
-        raise RecordError(f"{path} is damaged ({what}): run `overfly log recover` on it before it is sealed")
+        raise RecordError(f"{path} is damaged ({what}): run `overfly log recover` on it before it is compacted")
     return Survey(path, found, digests)
 
 
-def _seal(old: Survey, show: Show) -> Sealed:
+def _compact(old: Survey, show: Show) -> Compacted:
     path, target = old.path, finished_name(old.path)
     before = path.stat().st_size
 
     def check(new: Path) -> None:
         if _digests(salvage(new, "comparing", show)[1]) != old.digests:
-            raise RecordError(f"{path} could not be sealed: the copy is not the same; the log is as it was")
+            raise RecordError(f"{path} could not be compacted: the copy is not the same; the log is as it was")
 
     after = rewrite.write(target, CHUNK, old.found.profile, salvage(path, "sealing", show)[1], check)
     if target != path:
         path.unlink()
-    return Sealed(target, before, after, old.found.messages, sum(lost.bytes for lost in old.found.lost))
+    return Compacted(target, before, after, old.found.messages, sum(lost.bytes for lost in old.found.lost))
 
 
 def _digests(items: Iterable[Item]) -> tuple[bytes, bytes]:

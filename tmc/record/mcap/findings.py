@@ -26,7 +26,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Lost:
-    """A stretch of the file that nothing sound was found in: where, how long, and why."""
+    """A stretch of the file that nothing intact was found in: where, how long, and why."""
 
     at: int
     bytes: int
@@ -41,7 +41,7 @@ class Findings:
     """What came of reading a file to its end.
 
     `finished`: it was closed in order. `missing`: messages that are missing, as the numbers of others tell; `nameless`:
-    sound ones whose topic nothing sound tells. `notes`: what is wrong without anything being lost.
+    intact ones whose topic nothing intact tells. `notes`: what is wrong without anything being lost.
     """
 
     profile: str = ""

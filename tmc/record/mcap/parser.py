@@ -1,4 +1,4 @@
-"""The records of an MCAP file, one after the other, each checked; reading stops at the first that is not sound.
+"""The records of an MCAP file, one after the other, each checked; reading stops at the first that is not intact.
 
 A file is magic, records, magic; a record is an opcode (u8), a length (u64) and so many bytes. mcap's own readers take
 short reads for whole ones, skip records whose opcode was damaged, and check neither the summary nor attachments.
@@ -21,7 +21,7 @@ from mcap.stream_reader import get_chunk_data_stream
 
 MAGIC = b"\x89MCAP0\r\n"
 RECOVERED = "overfly/recovered"
-"""Metadata of a file that was made of what was sound in another one: what is missing in it, and that this is known."""
+"""Metadata of a file that was made of what was intact in another one: what is missing in it, and that this is known."""
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _DATA = frozenset((Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA))
@@ -29,7 +29,7 @@ _DATA = frozenset((Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATT
 
 
 class DamageError(Exception):
-    """The file is not sound from here on. `cut`: it just ends too early, at byte `size`, as after a kill."""
+    """The file is not intact from here on. `cut`: it just ends too early, at byte `size`, as after a kill."""
 
     def __init__(self, at: int, why: str, cut: bool = False, size: int = 0) -> None:
         super().__init__(f"{why}, at byte {at}")
@@ -125,7 +125,7 @@ def contents(file: IO[bytes]) -> Iterator[list[Raw] | Metadata | Attachment | No
         except (GeneratorExit, DamageError):
             raise
         except Exception as error:  # garbage makes zstandard and struct raise whatever they like
-            raise DamageError(at, f"a record is not sound ({error})") from None
+            raise DamageError(at, f"a record is not intact ({error})") from None
 
 
 class _Chunks:
@@ -141,7 +141,7 @@ class _Chunks:
         self._next: dict[int, int] = {}
 
     def messages(self, body: bytes) -> list[Raw]:
-        """All messages of a chunk; raises anything when it is not sound, a gap in the numbers included."""
+        """All messages of a chunk; raises anything when it is not intact, a gap in the numbers included."""
         head = ReadDataStream(BytesIO(body))
         chunk = Chunk.read(head)
         stream, size = get_chunk_data_stream(chunk)

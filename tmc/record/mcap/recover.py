@@ -1,4 +1,4 @@
-"""Makes a sound, finished log of a file that was cut or damaged: `overfly log recover`."""
+"""Makes a intact, finished log of a file that was cut or damaged: `overfly log recover`."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Recovery:
         """What the user is told."""
         found = self.found
         if self.out is None:
-            yield f"{self.path}: sound and finished, {found.messages:,} messages; there is nothing to do"
+            yield f"{self.path}: intact and finished, {found.messages:,} messages; there is nothing to do"
             return
-        yield f"{self.path}: {found.messages:,} messages are sound; they are in {self.out}"
+        yield f"{self.path}: {found.messages:,} messages are intact; they are in {self.out}"
         yield from (f"  {note}" for note in found.notes)
         yield from (f"  lost {part}" for part in losses(found))
         if self.clean:
@@ -54,7 +54,7 @@ def losses(found: Findings) -> Iterator[str]:
     if found.missing:
         yield f"{found.missing:,} messages, as the numbers of the others tell"
     if found.nameless:
-        yield f"{found.nameless:,} sound messages whose topics were described in what is lost"
+        yield f"{found.nameless:,} intact messages whose topics were described in what is lost"
 
 
 def recovered_name(path: Path) -> Path:
@@ -68,7 +68,7 @@ def finished_name(path: Path) -> Path:
 
 
 def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show: Show = unseen) -> Recovery:
-    """Write what is sound in `path` to `out` (by default beside it), or put it in its place.
+    """Write what is intact in `path` to `out` (by default beside it), or put it in its place.
 
     In place, a file from which something is lost is kept as `*.damaged-1`. RecordError when nothing can be read, when
     the result cannot be written, or when a process still writes the file.
@@ -86,7 +86,7 @@ def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show
             if in_place and not found.whole:
                 keep(path)
 
-        items = chain(_mark(found), salvage(path, "writing what is sound in", show)[1])
+        items = chain(_mark(found), salvage(path, "writing what is intact in", show)[1])
         rewrite.write(target, Journal().chunk, found.profile, items, before_it_is_replaced)
         if in_place and target != path:
             path.unlink()
@@ -103,11 +103,11 @@ def held(path: Path) -> IO[bytes]:
 
 
 def survey(path: Path, show: Show) -> Findings:
-    """Read all of a file; NoLogError when there is nothing sound in it."""
+    """Read all of a file; NoLogError when there is nothing intact in it."""
     found, items = salvage(path, "reading", show)
-    sound = sum(1 for _ in items)
-    if not sound and not (found.finished and found.whole):
-        raise NoLogError(f"{path} holds nothing that is sound: it is no MCAP file, or damaged all over")
+    intact = sum(1 for _ in items)
+    if not intact and not (found.finished and found.whole):
+        raise NoLogError(f"{path} holds nothing that is intact: it is no MCAP file, or damaged all over")
     return found
 
 

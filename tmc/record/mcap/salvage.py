@@ -1,6 +1,6 @@
-"""Finds all that is sound in an MCAP file, behind damage too: what `recover` and `seal` copy.
+"""Finds all that is intact in an MCAP file, behind damage too: what `recover` and `compact` copy.
 
-Only what a CRC vouches for is given out: chunks, and attachments. Where a record is not sound, the next chunk or
+Only what a CRC vouches for is given out: chunks, and attachments. Where a record is not intact, the next chunk or
 attachment whose CRC holds is looked for. Numbers of messages never go back, so a stretch that stands in the file twice
 counts once. Metadata have no CRC of their own and are taken as they stand, where they stand in line.
 """
@@ -24,7 +24,7 @@ from mcap.stream_reader import get_chunk_data_stream
 
 from tmc.record.disk import open_log
 from tmc.record.errors import NoLogError
-from tmc.record.mcap.chunks import HEAD, ChunkReader, Known, UnsoundError
+from tmc.record.mcap.chunks import HEAD, ChannelTable, ChunkReader, DamagedChunkError
 from tmc.record.mcap.findings import CUT, Findings, Item, Lost, Message, Show, unseen
 from tmc.record.mcap.parser import MAGIC, RECOVERED
 
@@ -39,7 +39,7 @@ _DATA_END = HEAD.size + 4
 
 
 def salvage(path: Path, what: str = "", show: Show = unseen) -> tuple[Findings, Iterator[Item]]:
-    """What is sound in a file, in its order; the findings are complete when all of it was taken.
+    """What is intact in a file, in its order; the findings are complete when all of it was taken.
 
     `what` is done with the items, which `show` is told. NoLogError when the file cannot be read or is empty.
     """
@@ -70,15 +70,15 @@ class _Scan:
 
     def __init__(self, data: mmap.mmap, found: Findings, active: bool, show: Callable[[float], None]) -> None:
         self.data, self.size, self.found, self.active, self.show = data, len(data), found, active, show
-        self.known = Known()
+        self.known = ChannelTable()
         self.attached: set[bytes] = set()
         self.numbered, self.told = True, False
         self.data_end = -1
         self.data_end = self._summary()
-        """Where the data ends, as a sound summary says; -1 without one."""
+        """Where the data ends, as a intact summary says; -1 without one."""
 
     def items(self) -> Iterator[Item]:
-        """Everything sound; fills in the findings."""
+        """Everything intact; fills in the findings."""
         at = self._start()
         while at < self.size and not self.found.finished:
             if at == self.data_end:
@@ -87,8 +87,8 @@ class _Scan:
             missing = self.found.missing
             try:
                 end, item = self._record(at)
-            except UnsoundError as unsound:
-                at = self._lose(at, str(unsound))
+            except DamagedChunkError as damaged:
+                at = self._lose(at, str(damaged))
                 continue
             if self.found.missing > missing and not self.found.lost:
                 self.found.lost.append(Lost(at, 0, "messages are missing before it"))
@@ -102,7 +102,7 @@ class _Scan:
         if self.data[: len(MAGIC)] == MAGIC:
             return len(MAGIC)
         why = "it does not begin as MCAP does"
-        with suppress(UnsoundError):
+        with suppress(DamagedChunkError):
             if self._body(len(MAGIC))[0] == Opcode.HEADER:
                 self._record(len(MAGIC))
                 self.found.lost.append(Lost(0, len(MAGIC), why))
@@ -110,7 +110,7 @@ class _Scan:
         return self._lose(0, why)
 
     def _lose(self, at: int, why: str) -> int:
-        """Note the loss from `at` to the next record that is sound, and go on there."""
+        """Note the loss from `at` to the next record that is intact, and go on there."""
         after = self._next(at + 1)
         why = "the length of a record is damaged" if why == CUT and after < self.size else why
         self.found.lost.append(Lost(at, after - at, why))
@@ -121,7 +121,7 @@ class _Scan:
         for match in _CANDIDATE.finditer(self.data, at):
             if self.data_end >= at and match.start() > self.data_end:
                 break
-            with suppress(UnsoundError):
+            with suppress(DamagedChunkError):
                 self._record(match.start(), dry=True)
                 return match.start()
         return self.data_end if self.data_end >= at else self.size
@@ -135,11 +135,11 @@ class _Scan:
     def _body(self, at: int) -> tuple[int, int, bytes]:
         """Opcode, end and body of the record at `at`."""
         if at + HEAD.size > self.size:
-            raise UnsoundError(CUT)
+            raise DamagedChunkError(CUT)
         opcode, length = HEAD.unpack_from(self.data, at)
         end = at + HEAD.size + length
         if end > (self.data_end if at < self.data_end else self.size):
-            raise UnsoundError(CUT)
+            raise DamagedChunkError(CUT)
         return opcode, end, self.data[at + HEAD.size : end]
 
     def _record(self, at: int, *, dry: bool = False) -> tuple[int, Item | None]:
@@ -147,39 +147,39 @@ class _Scan:
         opcode, end, body = self._body(at)
         read = _READERS.get(opcode)
         if read is None:
-            raise UnsoundError(f"a record of unknown kind {opcode}")
+            raise DamagedChunkError(f"a record of unknown kind {opcode}")
         try:
             return end, read(self, at, body, dry)
-        except UnsoundError:
+        except DamagedChunkError:
             raise
         except Exception as error:  # garbage makes zstandard and struct raise whatever they like
-            raise UnsoundError(f"a record is not sound: {error}") from None
+            raise DamagedChunkError(f"a record is not intact: {error}") from None
 
     def _header(self, at: int, body: bytes, _dry: bool) -> None:
         header = Header.read(ReadDataStream(BytesIO(body)))
         texts = vars(header).values()  # its profile, and the library that wrote it, each behind its length
         if at != len(MAGIC) or sum(4 + len(text.encode()) for text in texts) != len(body):
-            raise UnsoundError("its header is damaged")
+            raise DamagedChunkError("its header is damaged")
         self.found.profile, self.numbered = header.profile, header.profile == PROFILE
 
     def _index(self, _at: int, body: bytes, _dry: bool) -> None:
         """An index holds no fact, but its length must be right for the record behind it to be found."""
         if len(body) < 6 or int.from_bytes(body[2:6], "little") != len(body) - 6 or (len(body) - 6) % 16:
-            raise UnsoundError("an index is damaged")
+            raise DamagedChunkError("an index is damaged")
 
     def _metadata(self, _at: int, body: bytes, _dry: bool) -> Metadata:
         stream = ReadDataStream(BytesIO(body))
         metadata = Metadata.read(stream)
         if stream.count != len(body):
-            raise UnsoundError("metadata are damaged")
+            raise DamagedChunkError("metadata are damaged")
         self.told |= metadata.name == RECOVERED
         return metadata
 
     def _attachment(self, _at: int, body: bytes, dry: bool) -> Attachment:
         if zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
-            raise UnsoundError("the CRC of an attachment is wrong")
+            raise DamagedChunkError("the CRC of an attachment is wrong")
         if (digest := hashlib.sha256(body).digest()) in self.attached:
-            raise UnsoundError("an attachment was read before")
+            raise DamagedChunkError("an attachment was read before")
         if not dry:
             self.attached.add(digest)
         return Attachment.read(ReadDataStream(BytesIO(body)))
@@ -188,12 +188,12 @@ class _Scan:
         head = ReadDataStream(BytesIO(body))
         chunk = Chunk.read(head)
         if head.count != len(body) or chunk.uncompressed_size > _LARGEST:
-            raise UnsoundError("the size of a chunk is damaged")
+            raise DamagedChunkError("the size of a chunk is damaged")
         stream, size = get_chunk_data_stream(chunk)
         data = stream.read(size)
         if size != chunk.uncompressed_size or zlib.crc32(data) != chunk.uncompressed_crc:
-            raise UnsoundError("the CRC of a chunk is wrong")
-        known = Known(dict(self.known.schemas), dict(self.known.channels), dict(self.known.next))
+            raise DamagedChunkError("the CRC of a chunk is wrong")
+        known = ChannelTable(dict(self.known.schemas), dict(self.known.channels), dict(self.known.next))
         read = ChunkReader(known, self.numbered, 0 if self.found.lost else None)
         messages = read.messages(data)
         if not dry:
@@ -204,9 +204,9 @@ class _Scan:
         return messages
 
     def _data_end(self, at: int, body: bytes, dry: bool) -> None:
-        """The end of the data where no sound summary follows: believed in only if nothing else does."""
+        """The end of the data where no intact summary follows: believed in only if nothing else does."""
         if len(body) != 4 or self._next(at + 1) < self.size:
-            raise UnsoundError("it says that it ends, and goes on")
+            raise DamagedChunkError("it says that it ends, and goes on")
         if not dry:
             self.found.notes.append("its summary is damaged or cut, and made anew")
             self._finish(at)

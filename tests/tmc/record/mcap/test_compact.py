@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from tmc.kernel.config import Journal
 from tmc.record import schemas
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import CHUNK, seal_run
+from tmc.record.mcap.compact import CHUNK, compact_run
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
@@ -22,7 +22,7 @@ Message = tuple[str, str, int, int, int, bytes]
 
 
 def fill(folder: Path, process: str, rounds: int, *, close: bool = True) -> Path:
-    log = LogWriter(folder / f"{process}.mcap", process, Journal(flush=60.0), {"run": "abc"})
+    log = LogWriter(folder / f"{process}.mcap", process, Journal(flush_interval=60.0), {"run": "abc"})
     log.attach("config.json", "application/json", b"{}")
     for n in range(rounds):
         if process == "tmc":
@@ -50,10 +50,10 @@ def run(tmp_path: Path) -> Path:
 def test_all_is_kept_and_takes_less(run: Path) -> None:
     before = {"tmc": held(run / "tmc.mcap"), "uav-000": held(run / "uav-000.mcap.active")}
     facts = Log(run / "tmc.mcap").metadata()
-    sealed = seal_run(run)
+    compacted = compact_run(run)
     assert sorted(p.name for p in run.iterdir()) == ["tmc.mcap", "uav-000.mcap"]
     assert {name: held(run / f"{name}.mcap") for name in before} == before
-    for file in sealed:
+    for file in compacted:
         assert file.after == file.path.stat().st_size < file.before / 2
         assert file.messages == len(held(file.path)) and file.dropped == 0
         log = Log(file.path)
@@ -68,14 +68,14 @@ def test_all_is_kept_and_takes_less(run: Path) -> None:
             assert len(summary.chunk_indexes) == 1 and summary.chunk_indexes[0].compression == "zstd"
             assert len(summary.attachment_indexes) == len(summary.metadata_indexes) == 1
     assert Log(run / "tmc.mcap").metadata() == facts
-    assert [(f.before, f.after) for f in seal_run(run)] == [(f.after, f.after) for f in sealed]
+    assert [(f.before, f.after) for f in compact_run(run)] == [(f.after, f.after) for f in compacted]
 
 
 def test_large_logs_get_chunks_of_four_mebibytes(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
         for n in range(5):
             log.write("/learner/policy", schemas.Policy(version=n, model=bytes(2_000_000)))
-    seal_run(tmp_path)
+    compact_run(tmp_path)
     with (tmp_path / "tmc.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
         assert summary is not None
@@ -87,8 +87,8 @@ def test_a_torn_end_is_dropped_and_said(run: Path) -> None:
     path = run / "uav-000.mcap.active"
     whole = path.read_bytes()
     path.write_bytes(whole + b"\x06half a chunk")
-    sealed = {file.path.name: file for file in seal_run(run)}
-    assert sealed["uav-000.mcap"].dropped == len(b"\x06half a chunk")
+    compacted = {file.path.name: file for file in compact_run(run)}
+    assert compacted["uav-000.mcap"].dropped == len(b"\x06half a chunk")
     assert len(held(run / "uav-000.mcap")) == 50
 
 
@@ -99,7 +99,7 @@ def test_a_damaged_log_is_refused_and_nothing_is_changed(run: Path) -> None:
     path.write_bytes(data)
     before = {p.name: p.read_bytes() for p in run.iterdir()}
     with pytest.raises(RecordError, match=r"uav-000\.mcap\.active is damaged .*`overfly log recover`"):
-        seal_run(run)
+        compact_run(run)
     assert {p.name: p.read_bytes() for p in run.iterdir()} == before
 
 
@@ -109,9 +109,9 @@ def test_a_run_that_is_still_written_is_refused(run: Path) -> None:
         LogWriter(run / "uav-001.mcap", "uav-001", Journal(), {}),
         pytest.raises(RecordError, match=r"uav-001\.mcap\.active is being written by another process: end that one"),
     ):
-        seal_run(run)
+        compact_run(run)
     assert (run / "tmc.mcap").read_bytes() == before
-    assert len(seal_run(run)) == 3
+    assert len(compact_run(run)) == 3
 
 
 def test_a_full_disk_leaves_the_log_as_it_was(run: Path) -> None:
@@ -120,11 +120,11 @@ def test_a_full_disk_leaves_the_log_as_it_was(run: Path) -> None:
 import resource, signal, sys
 from pathlib import Path
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import seal_run
+from tmc.record.mcap.compact import compact_run
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 try:
-    seal_run(Path({str(run)!r}))
+    compact_run(Path({str(run)!r}))
 except RecordError as error:
     print(error)
 """
@@ -135,4 +135,4 @@ except RecordError as error:
 
 def test_no_run(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="holds no logs of a run"):
-        seal_run(tmp_path)
+        compact_run(tmp_path)

@@ -1,5 +1,5 @@
 """Logs cut and damaged anywhere: nothing is invented, nothing that was flushed before the damage is lost; nor after
-`recover`, which also finds what is sound behind it."""
+`recover`, which also finds what is intact behind it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Whole:
 
 def make(folder: Path, *, close: bool) -> Whole:
     path, chunks, clock = folder / "tmc.mcap", list[tuple[int, int, int, int]](), iter(range(10**9))
-    log = LogWriter(path, "tmc", Journal(flush=60.0), {"seed": "1"}, clock=lambda: next(clock))
+    log = LogWriter(path, "tmc", Journal(flush_interval=60.0), {"seed": "1"}, clock=lambda: next(clock))
     log.attach("config.json", "application/json", b'{"a": 1}')
     written = 0
     for n in range(ROUNDS):
@@ -172,7 +172,7 @@ def test_recovery_invents_nothing_and_finds_all_that_is_sound(
     try:
         result = recover(path)
     except RecordError as error:
-        assert "holds nothing that is sound" in str(error) or "is empty" in str(error)
+        assert "holds nothing that is intact" in str(error) or "is empty" in str(error)
         assert not flushed_before(whole, first) and not out.exists()
         return
     assert path.read_bytes() == data
@@ -195,9 +195,9 @@ def test_recovery_invents_nothing_and_finds_all_that_is_sound(
 
 def untouched(whole: Whole, stretches: list[tuple[int, int]]) -> Iterator[Message]:
     """Messages of chunks that no damage touches, if the first chunk is among these: it describes the topics."""
-    sound = [chunk for chunk in whole.chunks if all(end <= chunk[0] or at >= chunk[1] for at, end in stretches)]
-    if whole.chunks[0] in sound:
-        for _, _, first, upto in sound:
+    intact = [chunk for chunk in whole.chunks if all(end <= chunk[0] or at >= chunk[1] for at, end in stretches)]
+    if whole.chunks[0] in intact:
+        for _, _, first, upto in intact:
             yield from whole.messages[first:upto]
 
 
@@ -216,7 +216,7 @@ def write(folder: Path, whole: Whole, data: bytes) -> Path:
 def test_a_log_that_is_gone_on_with_loses_nothing_in_silence(
     wholes: dict[bool, Whole], tmp_path: Path, close: bool, what: list[Any]
 ) -> None:
-    """All that is sound is in the new file; or the damaged one is kept, and the new one says so."""
+    """All that is intact is in the new file; or the damaged one is kept, and the new one says so."""
     whole, folder = wholes[close], Path(mkdtemp(dir=tmp_path))
     data, first, _ = harm(whole, what)
     old, copied = write(folder, whole, data), folder / "copy.mcap.active"
@@ -233,16 +233,16 @@ def test_a_log_that_is_gone_on_with_loses_nothing_in_silence(
     assert found[: flushed_before(whole, first)] == whole.messages[: flushed_before(whole, first)]
     if not kept and found != whole.messages:
         try:
-            sound = recover(copied).found.messages
+            intact = recover(copied).found.messages
         except RecordError:
-            sound = 0
-        assert len(found) == sound
+            intact = 0
+        assert len(found) == intact
 
 
 def test_a_finished_file_needs_no_recovery(wholes: dict[bool, Whole], tmp_path: Path) -> None:
     result = recover(write(tmp_path, wholes[True], wholes[True].data))
     assert result.out is None and result.clean
-    assert [*result.lines()] == [f"{tmp_path / 'tmc.mcap'}: sound and finished, 72 messages; there is nothing to do"]
+    assert [*result.lines()] == [f"{tmp_path / 'tmc.mcap'}: intact and finished, 72 messages; there is nothing to do"]
     assert [p.name for p in tmp_path.iterdir()] == ["tmc.mcap"]
 
 
@@ -334,7 +334,7 @@ def test_a_recovered_log_is_resumed_with_its_gap(wholes: dict[bool, Whole], tmp_
 def test_what_cannot_be_recovered_is_said_and_leaves_nothing(wholes: dict[bool, Whole], tmp_path: Path) -> None:
     text = tmp_path / "text.mcap"
     text.write_text("hello, world, this is no log at all; " * 100)
-    with pytest.raises(RecordError, match="holds nothing that is sound: it is no MCAP file"):
+    with pytest.raises(RecordError, match="holds nothing that is intact: it is no MCAP file"):
         recover(text)
     with pytest.raises(RecordError, match=r"cannot be read \(No such file"):
         recover(tmp_path / "gone.mcap")

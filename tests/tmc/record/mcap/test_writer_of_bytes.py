@@ -11,7 +11,7 @@ from mcap.records import SummaryOffset
 from mcap.stream_reader import StreamReader
 
 from tmc.kernel.config import Journal
-from tmc.record.mcap.compact import seal_log
+from tmc.record.mcap.compact import compact_log
 from tmc.record.mcap.export import Export
 from tmc.record.writer import LogWriter
 
@@ -21,9 +21,9 @@ def logged(path: Path) -> None:
         log.log("info", "nothing is attached here")
 
 
-def sealed(path: Path) -> None:
+def compacted(path: Path) -> None:
     logged(path)
-    seal_log(path)
+    compact_log(path)
 
 
 def exported(path: Path) -> None:
@@ -32,7 +32,7 @@ def exported(path: Path) -> None:
     path.with_name("x.mcap").rename(path)
 
 
-@pytest.mark.parametrize("make", [logged, sealed, exported])
+@pytest.mark.parametrize("make", [logged, compacted, exported])
 def test_summary_offsets_lead_to_records(make: Callable[[Path], None], tmp_path: Path) -> None:
     path = tmp_path / "learner.mcap"
     make(path)
