@@ -173,7 +173,7 @@ def give_up(station: Station, i: int) -> None:
     episode = station.episode
     assert episode is not None
     station.lose(episode, i)
-    station.reorder_buffer.accept(station, episode)
+    station._accept_ready(episode)
     station.finalise()
 
 
