@@ -26,7 +26,7 @@ settings.load_profile("overfly")
 for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "PYTHONWARNINGS"):
     os.environ.pop(name, None)  # what the user's terminal and other programs are to do is no setting of the tests
 
-# A suite that a script runs in the background has INT ignored, and nohup ignores HUP: the commands that it starts would.
+# A suite that a script runs in the background has INT ignored, and so would the commands that it starts; nohup: HUP.
 signal.pthread_sigmask(signal.SIG_SETMASK, [])
 for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL),
                         (signal.SIGTERM, signal.SIG_DFL), (signal.SIGTSTP, signal.SIG_DFL),
