@@ -28,7 +28,7 @@ def _s(default: Any, about: str, unit: str = "", source: str = "") -> Any:
 
 
 @dataclass(frozen=True)
-class World:
+class WorldConfig:
     map: str = _s("downtown-toronto", "built-in map, or a text raster file", source="Sec. IV-A, Fig. 2(a)")
     roads: Literal["major", "main", "arterial", "all"] = _s(
         "main", "which classes of street are monitored", source="Sec. IV-A"
@@ -50,14 +50,14 @@ class World:
 
 
 @dataclass(frozen=True)
-class Team:
+class TeamConfig:
     size: int = _s(3, "N, the number of UAVs", "UAVs", "Sec. IV-C")
     controller: str = _s("policy", "who flies: policy, or planner:random, planner:random-road, planner:greedy")
     sensing_range: float = _s(1.5, "r_s in scenario II", "cell widths d", "Sec. IV-B")
 
 
 @dataclass(frozen=True)
-class Comms:
+class CommsConfig:
     period: int = _s(10, "T_u between two exchanges with the TMC; scenario I always has 1", "ticks", "Sec. II-C")
     phase: Literal["together", "staggered"] = _s(
         "together", "all UAVs exchange at t mod T_u = 0, or UAV i at floor(i T_u / N)", source="Algorithm 1; Sec. II-C"
@@ -67,7 +67,7 @@ class Comms:
 
 
 @dataclass(frozen=True)
-class Reward:
+class RewardConfig:
     collision: float = _s(-20.0, "r^c of a blocked move, instead of any other reward", source="Sec. IV-B")
     new_cell: float = _s(1.0, "r^n of a cell not visited so far in the episode", source="Sec. IV-B")
     weight: float = _s(5.0, "lambda, the weight of r^u in eq. (13)", source="Sec. IV-B")
@@ -83,7 +83,7 @@ class Reward:
 
 
 @dataclass(frozen=True)
-class Exploration:
+class ExplorationConfig:
     start: float = _s(0.5, "epsilon in the first episode", source="Table I")
     end: float = _s(0.05, "epsilon in the last episodes", source="Table I")
     fraction: float = _s(0.8, "share of the episodes over which epsilon falls linearly", source="left open")
@@ -93,14 +93,14 @@ class Exploration:
 
 
 @dataclass(frozen=True)
-class Observation:
+class ObservationConfig:
     view: Literal["whole", "ego"] = _s("whole", "the whole grid, or a square around the UAV", source="eq. (12): whole")
     radius: int = _s(8, "half width of the egocentric view: 2 radius + 1 cells", "cells")
     near: int = _s(0, "also feed the (2 near + 1)^2 cells around the UAV to the dense layer; 0: off", "cells")
 
 
 @dataclass(frozen=True)
-class Network:
+class NetworkConfig:
     channels: tuple[int, ...] = _s((16, 32), "filters of each convolution", source="Fig. 2(b), not available")
     kernel: int = _s(4, "width of the filters", "cells", "Table I")
     stride: int = _s(2, "stride of the convolutions", "cells", "left open")
@@ -108,7 +108,7 @@ class Network:
 
 
 @dataclass(frozen=True)
-class DQN:
+class DqnConfig:
     learning_rate: float = _s(1e-3, "Adam's step size", source="Table I")
     batch_size: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I")
     gamma: float = _s(0.99, "discount factor", "1/tick", "Table I")
@@ -121,7 +121,7 @@ class DQN:
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayConfig:
     capacity: int = _s(100_000, "transitions that the replay memory holds", "transitions", "Table I")
     learn_start: int = _s(128, "transitions before the first minibatch", "transitions", "left open: b")
     updates_per_tick: float = _s(1.0, "minibatches a tick of the team", "updates/tick", "Algorithm 1: one")
@@ -135,7 +135,7 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class Training:
+class TrainingConfig:
     episodes: int = _s(500, "E, episodes", "episodes", "Table I")
     ticks: int = _s(1000, "T_ep, ticks in an episode", "ticks of 60 s", "Table I")
     seed: int = _s(1, "key of every random draw")
@@ -145,7 +145,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Journal:
+class JournalConfig:
     flush_interval: float = _s(0.5, "longest time that a logged message stays in the process", "s")
     commit_interval: float = _s(
         0.05, "longest time that an accepted flight record waits for the TMC's group commit", "s"
@@ -157,7 +157,7 @@ class Journal:
 
 
 @dataclass(frozen=True)
-class Trial:
+class TrialConfig:
     """What `overfly verify` does to a mission to put its exactness to the test; an ordinary one has none of it."""
 
     stall: float = _s(0.0, "how long a UAV's process stalls before it says where it is; 0: never", "s")
@@ -176,18 +176,18 @@ class Config:
     """All settings of a mission. Immutable; `check` has been passed by every instance that `build` returns."""
 
     scenario: int = _s(2, "1: continuous communication, 2: limited communication", source="Sec. II-B")
-    world: World = field(default_factory=World)
-    team: Team = field(default_factory=Team)
-    comms: Comms = field(default_factory=Comms)
-    reward: Reward = field(default_factory=Reward)
-    exploration: Exploration = field(default_factory=Exploration)
-    observation: Observation = field(default_factory=Observation)
-    network: Network = field(default_factory=Network)
-    dqn: DQN = field(default_factory=DQN)
-    replay: Replay = field(default_factory=Replay)
-    training: Training = field(default_factory=Training)
-    journal: Journal = field(default_factory=Journal)
-    trial: Trial = field(default_factory=Trial)
+    world: WorldConfig = field(default_factory=WorldConfig)
+    team: TeamConfig = field(default_factory=TeamConfig)
+    comms: CommsConfig = field(default_factory=CommsConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    dqn: DqnConfig = field(default_factory=DqnConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    journal: JournalConfig = field(default_factory=JournalConfig)
+    trial: TrialConfig = field(default_factory=TrialConfig)
 
     @property
     def T_u(self) -> int:
