@@ -21,7 +21,7 @@ from deploy.run.progress import Progress, StatusPoller
 from deploy.run.supervisor import MissionFailed, Supervisor
 from tmc.analysis.run_config import attachments, settings_of
 from tmc.center.journal import journal_in
-from tmc.kernel import files, limits
+from tmc.kernel import files, forecast
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.policy import FlightError, check_view, view_shape
 from tmc.kernel.roadmap import COPY
@@ -91,9 +91,9 @@ def check_training(config: Config) -> None:
     """Raise ConfigError where nothing would be learned in a whole mission; and say what else will not be done."""
     if policy_spec.is_planner(config):
         return
-    if idle := limits.idle(config):
+    if idle := forecast.idle(config):
         raise ConfigError(idle)
-    for sentence in limits.remarks(config):
+    for sentence in forecast.remarks(config):
         process.tell(sentence)
 
 
