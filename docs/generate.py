@@ -1,4 +1,4 @@
-"""Write the pages of the reference that follow from the code: `python docs/generate.py`, or with `--check` compare them.
+"""Write the reference pages that follow from the code: `python docs/generate.py`; with `--check`, compare them.
 
 `reference/command.md` comes from the parsers of the command, `reference/settings.md` from the table of settings and the
 presets, and `reference/frames.md` from the messages and the codec.
@@ -107,9 +107,8 @@ def command_page() -> str:
     """`reference/command.md`."""
     parts = [
         "# The command\n",
-        "`overfly COMMAND` does one thing. `overfly COMMAND --help` prints what stands here, and `overfly --version` the "
-        "version.\nWhat a command means is told in the [guides](../guides/index.md); what it returns, in "
-        "[exit codes](exit-codes.md).\n",
+        "`overfly COMMAND --help` prints what stands here, and `overfly --version` the version. The "
+        "[guides](../guides/index.md) say\nwhat a command is for, and [exit codes](exit-codes.md) what it returns.\n",
         "| command | what it does |\n| --- | --- |",
         "\n".join(f"| [`{c.name}`](#overfly-{c.name}) | {cell(c.about)} |" for c in COMMANDS) + "\n",
     ]
