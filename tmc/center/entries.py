@@ -1,4 +1,4 @@
-"""Journal entries: what the station wants logged, as the fields of the log's schemas (docs/log-format.md)."""
+"""Journal entries: what the station wants logged, as the fields of the log's schemas (docs/reference/log-format.md)."""
 
 from __future__ import annotations
 
