@@ -1,8 +1,8 @@
 """One UAV as a core without I/O: it senses, ships its record when due, decides, moves, and says what it must wait for.
 
-Per tick t, in this order (docs/architecture.md): sense the peers near it and update the own map; at t mod T_u = phase
-ship the record and merge the TMC's map; observe o(t) and choose a(t); move, unless the target is held; the new cell is
-visited at t + 1.
+Per tick t, in this order (docs/explanation/architecture.md): sense the peers near it and update the own map; at t mod
+T_u = phase ship the record and merge the TMC's map; observe o(t) and choose a(t); move, unless the target is held; the
+new cell is visited at t + 1.
 """
 
 from __future__ import annotations

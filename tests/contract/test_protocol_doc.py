@@ -1,4 +1,4 @@
-"""docs/protocol.md says exactly what tmc/wire/messages.py says: each message, field, type, range, code and limit."""
+"""docs/reference/protocol.md says exactly what tmc/wire/messages.py says: each message, field, type, range, code and limit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tmc.kernel.world import World
 from tmc.wire import codec, fields, sockets
 from tmc.wire import messages as m
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text("utf-8")
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "reference" / "protocol.md").read_text("utf-8")
 NAMES = [cls.__name__ for cls in m.MESSAGES]
 POWERS = {2**62: "2^62", 2**63 - 1: "2^63 - 1", 2**31 - 1: "2^31 - 1"}
 UNITS = {"str": "characters", "bytes": "bytes", "array": "entries", "tensor": "entries"}
@@ -24,7 +24,7 @@ UNITS = {"str": "characters", "bytes": "bytes", "array": "entries", "tensor": "e
 def section(title: str, level: int = 2) -> str:
     """The text under a heading, up to the next heading of its level or above."""
     found = re.search(rf"^{'#' * level} {title}\n(.*?)(?=^#{{1,{level}}} |\Z)", DOCUMENT, re.MULTILINE | re.DOTALL)
-    assert found, f"docs/protocol.md has no section '{title}'"
+    assert found, f"docs/reference/protocol.md has no section '{title}'"
     return found[1]
 
 

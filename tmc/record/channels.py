@@ -1,4 +1,4 @@
-"""What is logged: one table of topics, their schema, and the process that writes them; see `docs/log-format.md`."""
+"""The table of topics: schema, and the process that writes them; see `docs/reference/log-format.md`."""
 
 from __future__ import annotations
 
