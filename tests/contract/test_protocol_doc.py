@@ -1,4 +1,4 @@
-"""docs/reference/protocol.md says exactly what tmc/wire/messages.py says: each message, field, type, range, code and limit."""
+"""The page on the protocol says what tmc/wire/messages.py says: each message, field, type, range, code, limit."""
 
 from __future__ import annotations
 
