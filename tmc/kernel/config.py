@@ -15,10 +15,11 @@ from operator import attrgetter
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tmc.kernel import limits
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.files import plain
 
 
-class ConfigError(ValueError):
+class ConfigError(OverflyError, ValueError):
     """A setting that cannot be: one sentence with the key and the mend."""
 
 
