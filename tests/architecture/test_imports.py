@@ -116,11 +116,11 @@ def test_the_command_loads_nothing_heavy_before_a_command_is_chosen() -> None:
     assert loaded_after("deploy.cli") == set()
 
 
-@pytest.mark.parametrize("role", ["actors", "tmc"])
 def test_the_face_loads_nothing_heavy_before_it_is_used() -> None:
     assert loaded_after("overfly") == set()
 
 
+@pytest.mark.parametrize("role", ["actors", "tmc"])
 def test_help_starts_no_network_library(role: str) -> None:
     command = [sys.executable, "-P", "-X", "importtime", "-m", role, "--help"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
