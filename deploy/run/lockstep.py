@@ -16,7 +16,6 @@ from deploy.run.progress import Progress
 from tmc.center.journal import Journal
 from tmc.center.roster import LEARNER, Outbox, uav_name
 from tmc.center.station import Station
-from tmc.center.status import status
 from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
@@ -106,7 +105,7 @@ class LockStep:
                 self.fleet.deliver(uav, reply)
         while self.fleet.step() | self._learn():
             if show is not None:
-                show(status(self.station))
+                show(self.station.status())
         if self.trainer is not None:
             self.final = self._push(self._loss)  # what a learner's process says last
 

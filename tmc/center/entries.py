@@ -44,7 +44,7 @@ def exchange(episode: EpisodeState, done: Exchange, policy: int) -> list[Journal
     return [sync, JournalEntry("/tmc/last_visit", {"last_visit": whole})]
 
 
-def truth(episode: EpisodeState, fresh: FinalTicks, steps: int, updates: int, policy: int) -> list[JournalEntry]:
+def final_ticks(episode: EpisodeState, fresh: FinalTicks, steps: int, updates: int, policy: int) -> list[JournalEntry]:
     """What became final: uncertainty and mean reward by tick, and in scenario I the new events."""
     values = {
         "episode": episode.number, "first": fresh.first, "steps": steps, "updates": updates, "policy": policy,

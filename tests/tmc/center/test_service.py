@@ -18,10 +18,10 @@ import zmq
 from actors.pilot import Pilot
 from actors.planners import LocalState
 from actors.tracks import TableTracks, TrackTable
+from tmc.center.commit_gate import MAX_TICKS_UNCOMMITTED
 from tmc.center.journal import journal_in
 from tmc.center.recovery import recover
 from tmc.center.roster import LEARNER
-from tmc.center.service import MAX_TICKS_UNCOMMITTED
 from tmc.center.station import Station
 from tmc.kernel.config import build, flat
 from tmc.kernel.grid import N_ACTIONS
