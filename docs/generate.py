@@ -162,10 +162,10 @@ def settings_page() -> str:
     parts = [
         "# Settings\n",
         prose(
-            "Every setting has a dotted name, a default, a unit and a source. `--set replay.capacity=50000` changes one, "
-            "and a list is written with commas: `--set network.channels=16,32`. The defaults are the paper's; where it "
-            "leaves a point open, the source says so. `overfly doctor --settings --preset NAME` prints them as a preset "
-            "has them."
+            "Every setting has a dotted name, a default, a unit and a source. `--set replay.capacity=50000` changes "
+            "one, and a list is written with commas: `--set network.channels=16,32`. The defaults are the paper's; "
+            "where it leaves a point open, the source says so. `overfly doctor --settings --preset NAME` prints them "
+            "as a preset has them."
         ),
         "Some settings have an option of their own:\n",
         "| option | setting |\n| --- | --- |",
@@ -303,9 +303,9 @@ def frames_page() -> str:
     parts = [
         "# Example frames\n",
         prose(
-            "One message of each type, as it goes over the wire: first the msgpack map of the first frame in words, then "
-            "the bytes of each frame in hex. `h'6301'` stands for bytes. Another implementation can be tested with them. "
-            "What the fields mean is in [the protocol](protocol.md#messages)."
+            "One message of each type, as it goes over the wire: first the msgpack map of the first frame in words, "
+            "then the bytes of each frame in hex. `h'6301'` stands for bytes. Another implementation can be tested "
+            "with them. What the fields mean is in [the protocol](protocol.md#messages)."
         ),
     ]
     for message in EXAMPLES:

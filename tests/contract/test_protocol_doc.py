@@ -1,4 +1,4 @@
-"""docs/reference/protocol.md says exactly what tmc/wire/messages.py says: each message, field, type, range, code and limit."""
+"""docs/reference/protocol.md agrees with tmc/wire/messages.py: each message, field, type, range, code and limit."""
 
 from __future__ import annotations
 
