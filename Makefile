@@ -14,7 +14,7 @@ demo: $(VENV)/.run
 test: $(VENV)/.dev $(VENV)/.readers
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-# The properties with examples that nobody has seen yet. A failure names the example: make it a test of its own.
+# The properties with new random examples. A failure names the example: make it a test of its own.
 explore: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m hypothesis --hypothesis-profile explore
 

@@ -15,6 +15,7 @@ exclude_patterns = ["_build"]
 myst_heading_anchors = 4
 myst_enable_extensions = ["deflist"]
 nitpicky = True
+smartquotes = False
 suppress_warnings: list[str] = []
 
 html_theme = "furo"

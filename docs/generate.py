@@ -10,6 +10,7 @@ import argparse
 import json
 import re
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -42,6 +43,11 @@ GROUPS = {
     "trial": "Trials",
 }
 """Titles of the groups of settings; a group that is not listed has its own name."""
+
+
+def prose(text: str, indent: str = "") -> str:
+    """A paragraph in lines of the width that all documents have."""
+    return textwrap.fill(text, 120, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False) + "\n"
 
 
 # The command.
@@ -89,7 +95,7 @@ def command_section(parser: argparse.ArgumentParser, name: str, depth: int) -> I
     usage = " ".join(filter(None, [f"overfly {name}", "..." if below else positional]))
     options = " [OPTIONS]" if any(written.startswith("-") for written, _ in rows) else ""
     yield f"{'#' * depth} overfly {name}\n"
-    yield f"{sentence(parser.description or '')}\n"
+    yield prose(sentence(parser.description or ""))
     yield f"```text\n{usage}{options}\n```\n"
     if rows:
         yield "| argument | what |\n| --- | --- |"
@@ -107,8 +113,10 @@ def command_page() -> str:
     """`reference/command.md`."""
     parts = [
         "# The command\n",
-        "`overfly COMMAND --help` prints what stands here, and `overfly --version` the version. The "
-        "[guides](../guides/index.md) say\nwhat a command is for, and [exit codes](exit-codes.md) what it returns.\n",
+        prose(
+            "`overfly COMMAND --help` prints what stands here, and `overfly --version` the version. The "
+            "[guides](../guides/index.md) say what a command is for, and [exit codes](exit-codes.md) what it returns."
+        ),
         "| command | what it does |\n| --- | --- |",
         "\n".join(f"| [`{c.name}`](#overfly-{c.name}) | {cell(c.about)} |" for c in COMMANDS) + "\n",
     ]
@@ -153,10 +161,12 @@ def settings_page() -> str:
     """`reference/settings.md`."""
     parts = [
         "# Settings\n",
-        "Every setting has a dotted name, a default, a unit and a source. `--set replay.capacity=50000` changes one, "
-        "and a list is\nwritten with commas: `--set network.channels=16,32`. The defaults are the paper's; where it "
-        "leaves a point open, the\nsource says so. `overfly doctor --settings --preset NAME` prints them as a preset "
-        "has them.\n",
+        prose(
+            "Every setting has a dotted name, a default, a unit and a source. `--set replay.capacity=50000` changes "
+            "one, and a list is written with commas: `--set network.channels=16,32`. The defaults are the paper's; "
+            "where it leaves a point open, the source says so. `overfly doctor --settings --preset NAME` prints them "
+            "as a preset has them."
+        ),
         "Some settings have an option of their own:\n",
         "| option | setting |\n| --- | --- |",
         "\n".join(f"| `{option} {code(metavar)}` | `{key}` |" for option, key, metavar in settings.OPTIONS) + "\n",
@@ -184,7 +194,7 @@ def presets() -> Iterator[str]:
     values = {name: flat(build(settings.read_preset(name)[0])) for name in names}
     defaults = flat(build({}))
     for name in names:
-        yield f"- `{name}`: {settings.read_preset(name)[1]}."
+        yield prose(f"- `{name}`: {settings.read_preset(name)[1]}.", "  ").rstrip()
     yield ""
     yield f"| setting | default | {' | '.join(f'`{name}`' for name in names)} |"
     yield "| --- | --- |" + " --- |" * len(names)
@@ -292,9 +302,11 @@ def frames_page() -> str:
     """`reference/frames.md`."""
     parts = [
         "# Example frames\n",
-        "One message of each type, as it goes over the wire: first the msgpack map of the first frame in words, then "
-        "the bytes of\neach frame in hex. `h'6301'` stands for bytes. An implementation of its own can be tested with "
-        "them. What the fields mean\nis in [the protocol](protocol.md#messages).\n",
+        prose(
+            "One message of each type, as it goes over the wire: first the msgpack map of the first frame in words, "
+            "then the bytes of each frame in hex. `h'6301'` stands for bytes. Another implementation can be tested "
+            "with them. What the fields mean is in [the protocol](protocol.md#messages)."
+        ),
     ]
     for message in EXAMPLES:
         parts += frame_section(message)

@@ -1,4 +1,4 @@
-"""Every file, name, test and setting that the paper map names is there; likewise the files in the other pages."""
+"""Every file, name, test and setting that the paper map names exists, and every file that the other pages name."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ WORDS = (
     "incarnation", "flight record", "exchange", "exchange tick", "final tick", "station", "pilot", "airspace",
     "reorder buffer", "sample queue", "rate limiter", "samples due", "error buffer", "commit", "durable", "episode log",
     "invariant", "observation hash", "ack log", "fault schedule", "replay", "belief", "look-ahead", "track table",
-    "beacon", "policy card", "policy spec", "run folder", "compact", "tau", "alpha", "T_u", "theta-", "roster", "relay",
-    "outbox", "record builder", "target-value cache", "reference learner", "checker", "proxy",
+    "beacon", "policy card", "policy spec", "run folder", "compact", "tau", "alpha", "T_u", "theta-", "roster",
+    "commit gate", "outbox", "record builder", "target-value cache", "reference learner", "checker", "proxy",
 )  # fmt: skip
 """What a reader of the code meets first: each must have its line."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
 from pathlib import Path
@@ -61,6 +62,33 @@ def test_the_readme_is_short_and_begins_with_the_commands() -> None:
     assert len(lines) <= 110
     first = "\n".join(lines[:30])
     assert "make demo" in first and "make test" in first and "](docs/images/paths.png)" in first
+
+
+def sentences() -> str:
+    """All strings of the sources, with a mark where an f-string has a value."""
+    found = []
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+            elif isinstance(node, ast.JoinedStr):
+                parts = (part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)
+                found.append("".join(map(str, parts)))
+    return "\n".join(found)
+
+
+def test_what_troubleshooting_quotes_is_said_by_the_command() -> None:
+    """Upper-case words, `...` and single letters of a quotation stand for values."""
+    said = sentences()
+    page = (DOCS / "troubleshooting.md").read_text("utf-8")
+    quotes = [
+        quote for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE) for quote in re.findall(r"`([^`]+)`", row)
+    ]
+    assert len(quotes) > 40
+    pieces = {
+        piece.strip(" :,'") for quote in quotes for piece in re.split(r"\.\.\.|\b[A-Z]{1,8}\b|\b[a-z]\b|\(|\)", quote)
+    }
+    assert sorted(piece for piece in pieces if len(piece) > 7 and piece not in said) == []
 
 
 def test_every_exit_code_is_in_the_document() -> None:
