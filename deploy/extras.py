@@ -28,6 +28,7 @@ PURPOSES = {
     "mcap": "logs",
     "protobuf": "logs",
     "foxglove-schemas-protobuf": "logs that viewers know",
+    "setproctitle": "names of the UAV processes in ps",
     "onnxruntime": "policies in the UAVs",
     "torch": "training",
     "onnx": "policy files",

@@ -148,8 +148,8 @@ class Forked:
         return self.returncode
 
 
-def forkserver_command(package: str, out: Path, preload: Sequence[str], room: int) -> tuple[str, ...]:
-    """The command line of the forkserver of `package`, with `room` characters for the command line of a child."""
+def forkserver_command(package: str, out: Path, preload: Sequence[str]) -> tuple[str, ...]:
+    """Return the command line of the forkserver of `package`, which imports the modules `preload` before it forks."""
     loads = [word for module in preload for word in ("--preload", module)]
     command = (sys.executable, "-P", "-m", "deploy.run.forkserver", "--of", package)
-    return (*command, f"--out={out.absolute()}", "--parent", str(os.getpid()), *loads, "--room", "." * room)
+    return (*command, f"--out={out.absolute()}", "--parent", str(os.getpid()), *loads)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
 import gc
 import importlib
 import json
@@ -25,12 +24,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from setproctitle import setproctitle
+
 from deploy import extras
+from tmc.kernel.text import printable
 from tmc.wire import process
 from tmc.wire.options import Options
 
-TITLE = ("python", "-P", "-m")
-"""What a command line begins with, for `ps` and whoever else looks for it; the name of the package follows."""
+TITLE = "overfly"
+"""First word of a process's title; the name of its package and its arguments follow."""
 
 Main = Callable[[list[str]], int]
 """What a process runs with its arguments; returns the exit code."""
@@ -121,7 +123,7 @@ def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: l
             os.dup2(old, new)
         for end in (*ends, output):
             os.close(end)
-        set_title((*TITLE, package, *argv))
+        set_title(package, argv)
         process.die_with_parent(server)
         code = main(argv)
     except SystemExit as left:  # argparse
@@ -136,19 +138,13 @@ def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: l
         os._exit(code)
 
 
-def set_title(words: tuple[str, ...]) -> None:
-    """Overwrite the command line that `ps` shows, as far as there is room in the one that the server got; Linux only.
+def set_title(package: str, argv: Sequence[str]) -> None:
+    """Set the command line that `ps` and /proc show, which a fork takes over from the server.
 
-    The kernel shows the memory from `arg_start` to `arg_end` of /proc/self/stat (proc(5), fields 48 and 49).
+    It is cut where it is longer than the server's own command line and environment together: the system has no more
+    memory for it.
     """
-    if sys.platform != "linux":
-        return
-    fields = Path("/proc/self/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
-    start, end = int(fields[45]), int(fields[46])
-    text = b"\0".join(os.fsencode(word) for word in words)[: max(end - start - 1, 0)]
-    if start and text:
-        ctypes.memset(start, 0, end - start)
-        ctypes.memmove(start, text, len(text))
+    setproctitle(printable(" ".join((TITLE, package, *argv))))
 
 
 def _do_without(a: argparse.Namespace) -> None:
@@ -161,7 +157,7 @@ def _do_without(a: argparse.Namespace) -> None:
     if a.preload:
         process.note("each process imports for itself what would have been preloaded")
         line = [sys.executable, "-P", "-m", "deploy.run.forkserver", f"--of={a.of}", f"--out={a.out}"]
-        os.execv(sys.executable, [*line, f"--parent={a.parent}", f"--room={a.room}"])
+        os.execv(sys.executable, [*line, f"--parent={a.parent}"])
 
 
 def _program(package: str, preload: Sequence[str]) -> Main:
@@ -189,10 +185,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--preload", action="append", default=[], metavar="MODULE", help="what all of them will need")
     parser.add_argument("--out", default="", help="the run's folder, to be found by")
     parser.add_argument("--parent", type=int, default=0, help="process to die with")
-    parser.add_argument("--room", default="", help="space for the command lines of the processes")
     a = parser.parse_args(argv)
     process.become_child(a.parent)
-    set_title((*TITLE, "deploy.run.forkserver", "--of", a.of, f"--out={a.out}", "--parent", str(a.parent)))
     run = _program(a.of, a.preload)
     if process.threads() > 1:
         _do_without(a)

@@ -74,8 +74,7 @@ class Supervisor:
 
     def _forkserver(self, package: str) -> ForkServer:
         """The forkserver of a package; it starts with the first process that it forks."""
-        room = max(len(" ".join(c.command)) for c in self.plan.children if c.fork_of == package) + 64
-        command = forkserver_command(package, self.out, self.plan.preload.get(package, ()), room)
+        command = forkserver_command(package, self.out, self.plan.preload.get(package, ()))
         return ForkServer(command, self._environment(package), self.log_of(f"forkserver-{package}"))
 
     def _environment(self, name: str) -> dict[str, str]:

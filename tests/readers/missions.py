@@ -106,7 +106,7 @@ def lose_one(out: Path) -> None:
     with subprocess.Popen([*LINE, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
         _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
         (silent,) = (
-            p for p in descendants(run.pid) if b"--id\0001\0" in (Path("/proc") / str(p) / "cmdline").read_bytes()
+            p for p in descendants(run.pid) if b"actors --id 1 " in (Path("/proc") / str(p) / "cmdline").read_bytes()
         )
         os.kill(silent, signal.SIGSTOP)
         _await(run, lambda: "/tmc/lost" in info(out / f"tmc.mcap{ACTIVE}").topics)

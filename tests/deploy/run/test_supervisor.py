@@ -302,7 +302,7 @@ def test_a_preloaded_module_that_starts_a_thread_is_left_out(tmp_path: Path) -> 
     (tmp_path / "threaded.py").write_text(
         "import threading, time\nthreading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
     )
-    line = forkserver_command("actors", tmp_path, ["threaded"], 200)
+    line = forkserver_command("actors", tmp_path, ["threaded"])
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     server = ForkServer(line, environment, tmp_path / "forkserver.txt")
     command = ("--id", "0", "--connect", f"ipc://{tmp_path}/nobody", "--out", str(tmp_path))
