@@ -14,6 +14,7 @@ from typing import Any
 from actors.planners import Controller, LocalState, QController
 from tmc.kernel.observation import ObservationBuilder
 from tmc.record.builders import record_digest
+from tmc.record.run_folder import RunFolder
 from tmc.record.schemas import ObservationHashes
 from tmc.wire.messages import Record
 
@@ -69,9 +70,9 @@ class AckLog:
     """A file of its own, in which each line is the number and the digest of a record that was acknowledged."""
 
     def __init__(self, out: Path, uav: int) -> None:
-        folder = out / "acks"
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = os.open(folder / f"uav-{uav:03d}.txt", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        path = RunFolder(out).acks_of(f"uav-{uav:03d}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
 
     def append(self, record: Record) -> None:
         """The TMC has acknowledged this record; in one write, so that a kill leaves no half of a line."""

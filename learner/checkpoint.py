@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +21,13 @@ from torch import Tensor
 from learner.trainer import State, Trainer, layout
 from tmc.kernel import files
 from tmc.kernel.config import flat
+from tmc.record.disk import NEW_SUFFIX, write_atomically
 
 FORMAT = 1
 KEEP = 3
 KEY, DIGEST = "overfly", "digest"
 """Entries of the file's metadata: all of `Meta` as JSON, and the SHA-256 of that and of the tensors."""
-PREFIX, SUFFIX, PART = "checkpoint-", ".safetensors", ".part"
+PREFIX, SUFFIX = "checkpoint-", ".safetensors"
 NETWORK = (
     "network.channels",
     "network.kernel",
@@ -73,24 +73,9 @@ def save(folder: Path, trainer: Trainer) -> Path:
     meta = Meta(FORMAT, state.updates, state.version, state.copied, list(trainer.shape), flat(trainer.config))
     text = json.dumps(vars(meta), sort_keys=True)
     path = folder / f"{PREFIX}{state.updates}{SUFFIX}"
-    _write(path, to_safetensors(state.tensors, {KEY: text, DIGEST: digest(text, state.tensors)}))
+    write_atomically(path, to_safetensors(state.tensors, {KEY: text, DIGEST: digest(text, state.tensors)}), sync=True)
     _prune(folder, state.updates)
     return path
-
-
-def _write(path: Path, data: bytes) -> None:
-    """The file is there with all its bytes, or as it was before, whenever the power goes."""
-    part = path.with_name(path.name + PART)
-    with part.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)  # the new name itself is on the disk only then
-    finally:
-        os.close(directory)
 
 
 def _prune(folder: Path, updates: int) -> None:
@@ -99,7 +84,7 @@ def _prune(folder: Path, updates: int) -> None:
     Files of later updates are damaged, or of a line that the user has left: they are not ours to delete.
     """
     old = [path for n, path in _numbered(folder) if n <= updates][KEEP:]
-    for path in [*old, *folder.glob(f"{PREFIX}*{SUFFIX}{PART}")]:
+    for path in [*old, *folder.glob(f"{PREFIX}*{SUFFIX}{NEW_SUFFIX}")]:
         path.unlink(missing_ok=True)
 
 

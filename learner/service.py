@@ -19,6 +19,8 @@ from tmc.kernel import files
 from tmc.kernel.config import build
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
+from tmc.record.disk import write_atomically
+from tmc.record.run_folder import RunFolder
 from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
 from tmc.wire import capacity, process, sockets
@@ -60,7 +62,7 @@ class Service:
 
     def learn(self, stop: Callable[[], bool]) -> bool:
         """The main loop; True when the mission came to its end, False when stopped. Leaves checkpoint and policy."""
-        folder, skipped = self.out / "checkpoints", list[str]()
+        folder, skipped = RunFolder(self.out).checkpoints, list[str]()
         saved = checkpoint.newest(folder, skipped.append)
         if skipped and saved is None:
             raise CheckpointError(f"no checkpoint in {folder} is intact: remove them all to begin with new weights")
@@ -194,7 +196,7 @@ class Service:
         if metrics.updates % self.config.training.publish_every == 0:
             self._push()
         if metrics.updates % self.config.training.checkpoint_every == 0:
-            checkpoint.save(self.out / "checkpoints", self.trainer)
+            checkpoint.save(RunFolder(self.out).checkpoints, self.trainer)
         self._report(metrics, minibatch)
 
     def _push(self) -> bytes:
@@ -227,8 +229,8 @@ class Service:
     def _finish(self) -> None:
         """The last metrics, the last checkpoint, the last policy, and its file."""
         self._tell(time.monotonic())
-        checkpoint.save(self.out / "checkpoints", self.trainer)
-        write_policy(self.out / "policies" / "final.onnx", self._push())
+        checkpoint.save(RunFolder(self.out).checkpoints, self.trainer)
+        write_policy(RunFolder(self.out).final_policy, self._push())
         sockets.send(self.sock, m.Bye("learner", -1, f"{self.trainer.updates} updates"))
 
     def close(self) -> None:
@@ -239,8 +241,6 @@ class Service:
 
 
 def write_policy(path: Path, model: bytes) -> None:
-    """Write a policy file whole or not at all."""
+    """Write a policy file whole or not at all; make its folder where there is none. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_suffix(".new")
-    new.write_bytes(model)
-    new.replace(path)
+    write_atomically(path, model, sync=False)

@@ -21,7 +21,7 @@ from actors.planners import LocalState
 from actors.policy import PolicyController
 from tests.command import PATIENCE_S, here
 from tmc.kernel.observation import ObservationBuilder
-from tmc.record import facts
+from tmc.record import queries
 
 ROOT = Path(__file__).parents[1]
 SMALL: dict[str, Any] = {"replay.learn_start": 8, "dqn.batch_size": 8}
@@ -122,7 +122,7 @@ def test_records_are_the_moves(flown: overfly.Run) -> None:
 def test_the_command_does_the_same(place: Path) -> None:
     assert here("fly", "planner:greedy", "--lockstep", "--ticks", 30, "--no-pictures", "--out", "A", cwd=place)
     run = overfly.fly("planner:greedy", out="B", lockstep=True, ticks=30, quiet=True)
-    assert facts.digest("A") == facts.digest(run.folder)
+    assert queries.digest("A") == queries.digest(run.folder)
     told = json.loads((place / "B" / "run.json").read_text())["command"]
     assert told == "overfly.fly('planner:greedy', ticks=30)"
     printed = here("evaluate", "planner:random", "--seeds", 2, "--ticks", 20, "--jobs", 1, cwd=place).stdout

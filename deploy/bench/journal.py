@@ -27,7 +27,8 @@ from tmc.center.roster import Outbox
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.world import World
 from tmc.record.mcap.compact import compact_log
-from tmc.record.reader import Log, run_files
+from tmc.record.reader import Log
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 from tmc.wire import process
 

@@ -31,7 +31,8 @@ from tmc.center.replay import Replay
 from tmc.kernel import observation
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.world import World
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import run_files
 from tmc.wire import messages, process
 from tmc.wire.messages import Minibatch
 

@@ -31,7 +31,8 @@ from deploy.run.supervisor import Supervisor
 from tmc.center.journal import Journal
 from tmc.kernel.config import Config, build, flat
 from tmc.kernel.world import World
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import RunFolder, run_files
 from tmc.wire import process
 
 TRANSPORTS = {"table": (True,), "beacons": (False,), "both": (True, False)}
@@ -166,7 +167,7 @@ def started(
     config: Config, policy: bytes | None, out: Path, *, table: bool = True
 ) -> Iterator[tuple[Supervisor, StatusPoller]]:
     """The processes of a mission in `out`, and who asks how far they are; they are stopped with the block."""
-    (out / "config.json").write_text(json.dumps(flat(config)), "utf-8")
+    RunFolder(out).config.write_text(json.dumps(flat(config)), "utf-8")
     file = None if policy is None else out / "flown.onnx"
     if file is not None and policy is not None:
         file.write_bytes(policy)

@@ -15,6 +15,7 @@ from tmc.analysis.run_data import RunData, read
 from tmc.analysis.summary import Summary
 from tmc.kernel.config import ConfigError
 from tmc.record import disk
+from tmc.record.run_folder import RunFolder
 from tmc.wire import process
 
 
@@ -70,7 +71,7 @@ def report(
     summary = summarize(flown)
     if episode is not None:
         flown.episode(episode)
-    kept = _keep(run / "summary.json", summary.to_json() + "\n", pictures=pictures)
+    kept = _keep(RunFolder(run).summary, summary.to_json() + "\n", pictures=pictures)
     wanted = pictures and kept
     print(summary.to_json() if as_json else reports.text(summary, int(wanted), kept=kept), flush=True)
     made = _draw(flown, summary, episode, baselines or {}) if wanted else []
@@ -82,7 +83,7 @@ def report(
 def _keep(path: Path, text: str, *, pictures: bool) -> bool:
     """Write the summary; False, and a sentence on stderr, where that cannot be."""
     try:
-        disk.put(path, text.encode(), sync=False)
+        disk.write_atomically(path, text.encode(), sync=False)
     except OSError as error:
         lost = "the summary is printed only" + (", and no pictures are made" if pictures else "")
         process.tell(f"{path} cannot be written ({error.strerror}): {lost}")

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from deploy.commands import log_check, log_export
 from tmc.kernel.text import printable
-from tmc.record import facts
+from tmc.record import queries
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, info, logs_in, run_files
+from tmc.record.reader import Log, info
+from tmc.record.run_folder import logs_in, run_files
 from tmc.wire.process import DONE, FAILED, tell
 
 JOURNAL_VIEWS = ("moves", "uncertainty", "events", "digest")
@@ -122,18 +123,18 @@ def _csv(header: str, rows: Iterable[tuple[object, ...]]) -> int:
 
 
 def _digest(args: argparse.Namespace) -> int:
-    episodes = facts.tracks(args.run)
+    episodes = queries.tracks(args.run)
     if not episodes:
         raise RecordError(f"{args.run} holds no flight record: nothing was flown")
-    print(f"{len(episodes)} episode(s) {facts.digest(args.run)}")
+    print(f"{len(episodes)} episode(s) {queries.digest(args.run)}")
     return 0
 
 
 _MAINS: dict[str, Callable[[argparse.Namespace], int]] = {
     "info": _info,
     "cat": _cat,
-    "moves": lambda a: _csv("tick,uav,cell", facts.moves(a.run, a.episode)),
-    "uncertainty": lambda a: _csv("tick,value", facts.uncertainty(a.run, a.episode)),
-    "events": lambda a: _csv("tick,cell", facts.events(a.run, a.episode)),
+    "moves": lambda a: _csv("tick,uav,cell", queries.moves(a.run, a.episode)),
+    "uncertainty": lambda a: _csv("tick,value", queries.uncertainty(a.run, a.episode)),
+    "events": lambda a: _csv("tick,cell", queries.events(a.run, a.episode)),
     "digest": _digest,
 } | {view: main for module in MORE for view, main in module.MAINS.items()}

@@ -15,7 +15,7 @@ from tmc.kernel.text import printable
 from tmc.record.errors import NoLogError, RecordError
 from tmc.record.mcap.compact import compact_run
 from tmc.record.mcap.recover import Recovery, recover
-from tmc.record.reader import logs_in
+from tmc.record.run_folder import logs_in
 from tmc.wire.process import DONE, FAILED, USAGE, tell
 
 PATIENCE_S = 2.0

@@ -12,7 +12,7 @@ from tmc.analysis.viewer import replay_file
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.merge import merge
-from tmc.record.reader import logs_in
+from tmc.record.run_folder import logs_in
 from tmc.wire.process import DONE, FAILED, tell
 
 ABOUT = {

@@ -13,6 +13,7 @@ from tmc.kernel.config import Config, ConfigError, build, flat
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import compact_log
+from tmc.record.run_folder import RunFolder
 from tmc.wire.process import DONE, tell
 from tmc.wire.sockets import check_free
 
@@ -78,7 +79,7 @@ def _sealed(code: int, config: Config, out: Path) -> int:
     """The exit code of a TMC, whose journal is rewritten for keeping when its mission is over."""
     if code == DONE:
         try:
-            compacted = compact_log(out / "tmc.mcap", Progress(config, 1, 0.0).work)
+            compacted = compact_log(RunFolder(out).journal, Progress(config, 1, 0.0).work)
             print(f"overfly: the log is compacted: {compacted.before:,} bytes before, {compacted.after:,} after")
         except RecordError as error:
             tell(f"the log stays as it was written: {error}")

@@ -20,6 +20,7 @@ from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
+from tmc.record.run_folder import RunFolder
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 
@@ -158,7 +159,7 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
         if trainer is not None:
             from learner.service import write_policy  # noqa: PLC0415
 
-            write_policy(out / "policies" / "final.onnx", mission.final)
+            write_policy(RunFolder(out).final_policy, mission.final)
     finally:
         journal.writer.close()
 

@@ -21,17 +21,16 @@ from deploy.run import lockstep, plan
 from deploy.run.progress import Progress, StatusPoller
 from deploy.run.supervisor import MissionFailed, Supervisor
 from tmc.analysis.run_config import attachments, settings_of
-from tmc.center.journal import journal_in
 from tmc.kernel import files, forecast
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.policy import FlightError, check_view, view_shape
-from tmc.kernel.roadmap import COPY
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World, world_of_run
 from tmc.record import disk
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import compact_log
 from tmc.record.reader import Log
+from tmc.record.run_folder import RunFolder
 from tmc.wire import capacity, process
 
 POLL_S = 0.1
@@ -105,19 +104,19 @@ def needs(config: Config, policy: bytes | None) -> tuple[str, ...]:
 
 def flown_policy(out: Path) -> Path:
     """The fixed policy of a run that flies one."""
-    return out / "policies" / "flown.onnx"
+    return RunFolder(out).fixed_policy
 
 
 def require_settings(out: Path) -> Config:
     """The settings that a run in `out` was begun with; ConfigError where `config.json` has others, or it has none."""
-    journal = journal_in(out)
+    journal = RunFolder(out).existing_journal()
     if journal is None:
         raise ConfigError(f"{out} holds no journal (tmc.mcap): --resume takes the folder of a run that was begun")
     settings = settings_of(out, journal)
     if settings.edited:
         keys = ", ".join(settings.edited)
         mend = "put it back, or remove the file and the log's settings are used; other settings need a run of their own"
-        raise ConfigError(f"{out / 'config.json'} was edited since the run was begun, in {keys}: {mend}")
+        raise ConfigError(f"{RunFolder(out).config} was edited since the run was begun, in {keys}: {mend}")
     return settings.config
 
 
@@ -127,9 +126,9 @@ def interrupted(out: Path, say: Callable[[str], None] = process.tell) -> tuple[W
     `say` takes a sentence on what is damaged.
     """
     config = require_settings(out)
-    journal = journal_in(out)
+    journal = RunFolder(out).existing_journal()
     assert journal is not None
-    with disk.open_held(journal, "rb"):
+    with disk.open_locked(journal, "rb"):
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
         text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
@@ -139,7 +138,8 @@ def interrupted(out: Path, say: Callable[[str], None] = process.tell) -> tuple[W
     world = world_of_run(config, out)
     _check(world, policy, str(file))
     if attachments(journal).get("map.csv", world.map.csv()) != world.map.csv():
-        name = out / COPY if (out / COPY).exists() else config.world.map
+        copy = RunFolder(out).map_copy
+        name = copy if copy.exists() else config.world.map
         raise ConfigError(f"the map {name} has changed since the run was begun: put it back as it was")
     if log.metadata().get("run") == lockstep.RUN and policy is None and not policy_spec.is_planner(config):
         raise ConfigError(f"{out} was trained in lock step, which leaves no checkpoint to go on from: run it again")
@@ -152,27 +152,27 @@ def keep_settings(out: Path, world: World, policy: bytes | None) -> Path | None:
 
     On the disk at once, since after a power cut there is no journal yet that has a copy.
     """
-    disk.put(out / "config.json", (json.dumps(flat(world.config), indent=1) + "\n").encode(), sync=True)
+    disk.write_atomically(RunFolder(out).config, (json.dumps(flat(world.config), indent=1) + "\n").encode(), sync=True)
     if world.map.source:
-        disk.put(out / COPY, world.map.source.encode(), sync=True)
+        disk.write_atomically(RunFolder(out).map_copy, world.map.source.encode(), sync=True)
     if policy is None:
         return None
     file = flown_policy(out)
     file.parent.mkdir(parents=True, exist_ok=True)
-    disk.put(file, policy, sync=True)
+    disk.write_atomically(file, policy, sync=True)
     return file
 
 
 def finished(out: Path) -> bool:
     """True when the processes of the run in `out` came to its end, all of them in order."""
     codes = _told(out).get("exit_codes", {})
-    return set(codes.values()) == {0} and (out / "tmc.mcap").exists()
+    return set(codes.values()) == {0} and RunFolder(out).journal.exists()
 
 
 def _told(out: Path) -> dict[str, Any]:
     """What `run.json` says; nothing where it is gone or broken."""
     try:
-        told = json.loads(files.read_text(out / "run.json"))
+        told = json.loads(files.read_text(RunFolder(out).outcome))
     except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
@@ -275,7 +275,7 @@ class Mission:
     def _compact(self) -> None:
         """Rewrite the journal of a mission that is over for keeping; its sizes are in `run.json`."""
         try:
-            compacted = compact_log(self.out / "tmc.mcap", self.progress.work)
+            compacted = compact_log(RunFolder(self.out).journal, self.progress.work)
         except RecordError as error:  # all of it is there, in small chunks
             self.progress.note(f"the log stays as it was written: {error}")
         else:
@@ -295,9 +295,10 @@ class Mission:
             "seconds": round(time.monotonic() - self._start, 1),
         }
         try:
-            disk.put(self.out / "run.json", (json.dumps(facts | more, indent=1) + "\n").encode(), sync=False)
+            text = json.dumps(facts | more, indent=1) + "\n"
+            disk.write_atomically(RunFolder(self.out).outcome, text.encode(), sync=False)
         except OSError as error:
-            self.progress.note(f"cannot write {self.out / 'run.json'}: {error.strerror}")
+            self.progress.note(f"cannot write {RunFolder(self.out).outcome}: {error.strerror}")
 
 
 def command_line() -> str:

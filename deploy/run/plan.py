@@ -13,6 +13,7 @@ import deploy
 from actors.planners import PREFIX
 from deploy.run import machine, scratch
 from tmc.kernel.config import Config
+from tmc.record.run_folder import RunFolder
 
 ROOT = Path(deploy.__file__).resolve().parent.parent
 """The folder that holds overfly.py and the four packages."""
@@ -59,7 +60,7 @@ def make(config: Config, out: Path, *, policy: Path | None, table: bool = True) 
     machine.require(config, learns=learns, out=out)
     out, shared = out.absolute(), scratch.make(config, table=table)
     tmc = [sys.executable, "-P", "-m", "tmc"]  # -P: the user's folder may hold packages of the same names
-    tmc += [f"--config={out / 'config.json'}", "--bind", shared.endpoint, "--resume"]
+    tmc += [f"--config={RunFolder(out).config}", "--bind", shared.endpoint, "--resume"]
     tmc += ["--parent", str(os.getpid()), f"--out={out}"]
     tmc += [f"--tracks={shared.tracks}"] if table else []
     tmc += [f"--policy={policy.absolute()}"] if policy else []

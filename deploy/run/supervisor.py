@@ -16,6 +16,7 @@ from deploy.run import plan as plans
 from deploy.run.forked import ForkServer, Handle, forkserver_command
 from deploy.run.suspension import Suspension
 from tmc.kernel.text import printable
+from tmc.record.run_folder import RunFolder
 from tmc.wire import process
 
 BACKOFF_S = (0.1, 5.0)
@@ -67,7 +68,7 @@ class Supervisor:
 
     def start(self) -> None:
         """Start all processes."""
-        (self.out / "logs").mkdir(exist_ok=True)
+        RunFolder(self.out).outputs.mkdir(exist_ok=True)
         self._suspension = Suspension(lambda: self.pids().values())
         for running in self.running:
             self._start(running)
@@ -82,7 +83,7 @@ class Supervisor:
 
     def log_of(self, name: str) -> Path:
         """Where a process's own output goes."""
-        return self.out / "logs" / f"{name}.txt"
+        return RunFolder(self.out).output(name)
 
     def _start(self, running: _Running) -> None:
         child, log = running.child, self.log_of(running.child.name)

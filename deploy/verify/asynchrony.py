@@ -20,7 +20,8 @@ from tmc.kernel.grid import Grid
 from tmc.kernel.world import World
 from tmc.record import compare
 from tmc.record.channels import uav_topic
-from tmc.record.reader import read, run_files
+from tmc.record.reader import read
+from tmc.record.run_folder import run_files
 
 SIDE = 120
 """Width of the plain, in cells."""

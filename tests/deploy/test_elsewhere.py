@@ -23,7 +23,7 @@ from tests.command import LINE, here, overfly
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import Grid
 from tmc.kernel.policy import view_shape
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.wire.sockets import free_port
 
 EGO = {"observation.view": "ego", "observation.radius": 4, "network.channels": (4,), "network.dense": 8}

@@ -117,7 +117,7 @@ def test_a_writer_killed_in_between_leaves_the_older_checkpoint(tmp_path, traine
         patch.setattr(os, "fsync", kill) if step == "fsync" else patch.setattr(type(old), "replace", kill)
         with pytest.raises(Killed):
             checkpoint.save(tmp_path, trained(3))
-    assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-3.safetensors.part"]
+    assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-3.safetensors.new"]
     assert checkpoint.newest(tmp_path).name == old.name
     checkpoint.save(tmp_path, trained(4))
     assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-4.safetensors"]

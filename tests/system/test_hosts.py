@@ -12,7 +12,7 @@ import pytest
 
 from tests.command import LINE, PATIENCE_S
 from tests.system.hosts import Hosts, hosts, why_not
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.record.reader import read
 
 TEAM = ("--actors", 4, "--seed", 7)

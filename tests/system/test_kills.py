@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.command import LINE, PATIENCE_S
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 
 
 @pytest.mark.parametrize("options", [(), ("--scenario", "1"), ("--set", "comms.phase=staggered")], ids=str)

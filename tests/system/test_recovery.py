@@ -20,8 +20,8 @@ from tests.command import LINE, PATIENCE_S
 from tmc.analysis.invariants.check import check
 from tmc.center.journal import journal_in
 from tmc.kernel.config import JournalConfig
-from tmc.record.facts import digest
-from tmc.record.mcap.parser import frames
+from tmc.record.mcap import strict
+from tmc.record.queries import digest
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
@@ -235,7 +235,7 @@ def test_a_damaged_journal_is_gone_on_with_and_said(tmp_path: Path, capsys: pyte
     short = ("--lockstep", "--ticks", "60", "--episodes", "4", "--no-pictures")
     assert main(["fly", "planner:greedy", *short, "--out", str(out)]) == 0
     with (out / "tmc.mcap").open("rb") as file:
-        chunks = [at for at, opcode, _ in frames(file) if opcode == Opcode.CHUNK]
+        chunks = [at for at, opcode, _ in strict.records(file) if opcode == Opcode.CHUNK]
     data = bytearray((out / "tmc.mcap").read_bytes())
     data[chunks[0] + 5] ^= 1
     (out / "tmc.mcap").unlink()

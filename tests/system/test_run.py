@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.command import PATIENCE_S, descendants
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.record.reader import Log
 
 GREEDY = ("fly", "planner:greedy", "--no-pictures")

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.command import LINE
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 
 FLY = ("fly", "planner:greedy", "--actors", "2", "--ticks", "300", "--no-pictures")
 LONG = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60000", "--episodes", "50", "--no-pictures")

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.command import LINE, PATIENCE_S
-from tmc.record.reader import Log, info, run_files
+from tmc.record.reader import Log, info
+from tmc.record.run_folder import run_files
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 FLY = ("fly", "planner:greedy", "--actors", 2, "--ticks", 60, "--seed", 5, "--set", "comms.phase=staggered",

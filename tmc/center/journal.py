@@ -17,8 +17,9 @@ from tmc.center.roster import Outbox
 from tmc.kernel.config import flat
 from tmc.kernel.world import World
 from tmc.record import builders
-from tmc.record.channels import ACTIVE, CHANNELS
-from tmc.record.disk import put
+from tmc.record.channels import CHANNELS
+from tmc.record.disk import write_atomically
+from tmc.record.run_folder import RunFolder
 from tmc.record.schemas import message_class
 from tmc.record.writer import LogWriter
 
@@ -44,7 +45,7 @@ class Journal:
         self.world, self.folder = world, folder
         self._timer, self._started = timer, timer()
         self.found = resume and journal_in(folder) is not None
-        self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run}, resume=resume)
+        self.writer = LogWriter(RunFolder(folder).journal, "tmc", world.config.journal, {"run": run}, resume=resume)
         self._policies: set[int] = set()
         self._stale = {*policies_in(folder)} if self.found else set[int]()
         self._since: float | None = None
@@ -87,7 +88,7 @@ class Journal:
         """Log, in a trial with power cuts, how much of which file the disk has: the trial cuts the file there."""
         config = self.world.config
         if config.trial.ack_log and config.journal.durability == "power":
-            path = self.folder / "acks" / "tmc.txt"
+            path = RunFolder(self.folder).acks_of("tmc")
             path.parent.mkdir(exist_ok=True)
             now = self.writer.active.stat()
             with path.open("a", encoding="utf-8") as file:
@@ -98,7 +99,7 @@ class Journal:
         for version in held.keys() - self._policies:
             path = policy_path(self.folder, version)
             path.parent.mkdir(parents=True, exist_ok=True)
-            put(path, held[version], sync=self.world.config.journal.durability == "power")
+            write_atomically(path, held[version], sync=self.world.config.journal.durability == "power")
         for version in (self._policies | self._stale) - held.keys():
             policy_path(self.folder, version).unlink(missing_ok=True)
         self._policies, self._stale = set(held), set()
@@ -117,19 +118,17 @@ class Journal:
 
 def journal_in(folder: Path) -> Path | None:
     """Return the journal in a run folder, finished or left behind; None if there is none, or it is empty."""
-    paths = (folder / f"tmc.mcap{ACTIVE}", folder / "tmc.mcap")
-    return next((path for path in paths if path.is_file() and path.stat().st_size), None)
+    return RunFolder(folder).existing_journal()
 
 
 def policy_path(folder: Path, version: int) -> Path:
     """Return where the TMC keeps the policy with this version while a UAV may ask for it."""
-    return folder / "policies" / f"policy-{version}.onnx"
+    return RunFolder(folder).policy(version)
 
 
 def policies_in(folder: Path) -> list[int]:
     """Return the versions of the policy files in a run folder."""
-    names = (path.stem.removeprefix("policy-") for path in (folder / "policies").glob("policy-*.onnx"))
-    return [int(name) for name in names if name.isdecimal()]
+    return RunFolder(folder).policy_versions()
 
 
 def roads_geojson(world: World) -> str:

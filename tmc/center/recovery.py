@@ -23,7 +23,7 @@ from tmc.kernel import files
 from tmc.kernel.config import Config
 from tmc.record.builders import to_record
 from tmc.record.errors import RecordError
-from tmc.record.mcap.parser import Raw
+from tmc.record.mcap.parser import Message as LoggedMessage
 from tmc.record.reader import Log, decode
 
 Taker = Callable[[Station, Any, Path, float], None]
@@ -49,7 +49,7 @@ def recover(station: Station, path: Path, now: float) -> list[JournalEntry]:
 
 def play(
     station: Station,
-    journal: Iterable[Raw],
+    journal: Iterable[LoggedMessage],
     folder: Path,
     now: float,
     skip: range = range(0),

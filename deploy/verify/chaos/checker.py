@@ -9,10 +9,10 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tmc.center.journal import journal_in
 from tmc.record.builders import record_digest, to_record
 from tmc.record.channels import ACTIVE
 from tmc.record.reader import Log
+from tmc.record.run_folder import RunFolder
 
 Number = tuple[int, int]
 """A record: UAV and sequence."""
@@ -60,14 +60,14 @@ def check_delivery(out: Path, known: Collection[Number] = ()) -> DeliveryReport:
 
 
 def _journal(out: Path) -> Path:
-    found = journal_in(out)
+    found = RunFolder(out).existing_journal()
     assert found is not None, f"{out} holds no journal"
     return found
 
 
 def ack_files(out: Path) -> list[Path]:
     """Where UAVs have acknowledged."""
-    return sorted((out / "acks").glob("uav-*.txt"))
+    return sorted(RunFolder(out).acks.glob("uav-*.txt"))
 
 
 def _acks(out: Path) -> Iterable[tuple[Number, str]]:
@@ -92,7 +92,7 @@ class Snapshot:
     @classmethod
     def take(cls, out: Path) -> Snapshot:
         """Keep the journal under another name: the next TMC writes a new file."""
-        link = out / "acks" / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
+        link = RunFolder(out).acks / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
         os.link(_journal(out), link)
         acknowledged = {}
         for path in ack_files(out):

@@ -21,6 +21,7 @@ from deploy.verify.chaos.faults import CUT, KILL, POWER, STOP, Fault, role
 from deploy.verify.chaos.power import cut_tails
 from deploy.verify.chaos.proxy import CuttableProxy
 from deploy.verify.chaos.schedule import FaultSchedule, Growth
+from tmc.record.run_folder import RunFolder
 
 LOOK_INTERVAL_S = 0.02
 """Seconds between two looks at the processes and their progress."""
@@ -185,7 +186,7 @@ class Disturbed(Mission):
         """Take those who are back out of `awaited`; true when that was the last."""
         pids = self.supervisor.pids()
         for name, who in [*awaited.items()]:
-            acks = self.out / "acks" / f"{name}.txt"
+            acks = RunFolder(self.out).acks_of(name)
             if who.growth is None:
                 if pids.get(name, who.killed) != who.killed:
                     who.growth, who.acks = Growth(), size_of(acks)

@@ -7,6 +7,7 @@ from pathlib import Path
 from random import Random
 
 from tmc.record.channels import ACTIVE
+from tmc.record.run_folder import RunFolder
 
 UNSYNCED = (
     f"uav-*.mcap{ACTIVE}",
@@ -23,7 +24,7 @@ def cut_tails(out: Path, draw: Random) -> int:
         for path in sorted(out.glob(pattern)):
             if draw.random() < 0.5:
                 os.truncate(path, draw.randint(0, path.stat().st_size))
-    journal = out / f"tmc.mcap{ACTIVE}"
+    journal = RunFolder(out).active_journal
     size, kept = journal.stat().st_size, synced(out, journal)
     left = draw.randint(kept, size)
     os.truncate(journal, left)
@@ -35,7 +36,7 @@ def synced(out: Path, journal: Path) -> int:
 
     Half of it where the TMC never waits for the disk: the system writes by itself now and then.
     """
-    now, told = journal.stat(), out / "acks" / "tmc.txt"
+    now, told = journal.stat(), RunFolder(out).acks_of("tmc")
     if not told.exists():
         return now.st_size // 2
     inode, size = told.read_text("utf-8").split("\n")[-2].split()

@@ -14,8 +14,9 @@ from deploy.verify.exactness import Quiet, fly
 from tmc.analysis.invariants.check import check as check_log
 from tmc.kernel.config import Config, build
 from tmc.kernel.world import World
-from tmc.record import facts
-from tmc.record.reader import read, run_files
+from tmc.record import queries
+from tmc.record.reader import read
+from tmc.record.run_folder import run_files
 from tmc.wire import process
 
 TRAIN: dict[str, Any] = {
@@ -108,7 +109,7 @@ def _compare(result: TrialResult, world: World, policy: bytes | None, out: Path)
     """Hold a mission against the same in lock step: every cell, and the maps and the replay memory of each episode."""
     calm = out.with_name(f"{out.name}-lockstep")
     fly(check(build(UNDISTURBED, world.config), policy), policy, calm, in_one_process=True)
-    if facts.digest(out) != facts.digest(calm):
+    if queries.digest(out) != queries.digest(calm):
         result.faults.append(f"{out.name} flew other cells than the same mission in lock step")
     states = _states(out)
     for episode, state in _states(calm).items():
