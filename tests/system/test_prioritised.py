@@ -42,7 +42,7 @@ def test_it_trains_as_processes_and_its_log_is_sound(
     assert any(r.values for r in records)
     for name in ("tmc", "learner"):  # neither refused what the other said
         said = [e.message.message for e in Log(out / f"{name}.mcap").entries(["/log"])]
-        assert not [text for text in said if "rejected" in text or "the TMC says" in text]
+        assert not [text for text in said if "rejected" in text or "error from the TMC" in text]
 
 
 def test_the_learner_changes_priorities_and_the_journal_has_the_first_ones(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def test_a_system_that_reserves_no_room_gets_zeros(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(os, "posix_fallocate", unknown)
     tracks.create_table(tmp_path / "tracks", 200, 1000)
     content = (tmp_path / "tracks").read_bytes()
-    assert len(content) == tracks.table_bytes(200, 1000) > tracks._PIECE
+    assert len(content) == tracks.table_bytes(200, 1000) > tracks._CHUNK_BYTES
     assert not any(content)
 
 
