@@ -276,7 +276,7 @@ def open_run(path: StrPath) -> Run:
     >>> overfly.open_run("demo")
     Run('demo')
     """
-    from tmc.record.reader import run_files
+    from tmc.record.run_folder import run_files
 
     run_files(path)
     return Run(path)

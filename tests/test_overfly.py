@@ -99,10 +99,10 @@ def test_every_name_is_there() -> None:
 def test_it_gives_what_the_log_holds(flown: overfly.Run) -> None:
     run = overfly.open_run(flown.folder)
     assert run.episodes == (1, 2) and (run.config.team.size, run.config.training.ticks) == (2, 30)
-    rows = list(facts.moves(run.folder, 2))
+    rows = list(queries.moves(run.folder, 2))
     assert run.moves(2).dtype.kind == "i" and run.moves(2).shape == (31, 2)
     assert [(t, i, run.moves(2)[t, i]) for t, i, _ in rows] == rows
-    assert dict(enumerate(run.uncertainty(1).tolist())) == dict(facts.uncertainty(run.folder, 1))
+    assert dict(enumerate(run.uncertainty(1).tolist())) == dict(queries.uncertainty(run.folder, 1))
     assert np.isfinite(run.reward(1)[1:]).all() and run.events(1).shape == (0, 2)
     assert run.metrics["uncertainty"][0] == pytest.approx(run.uncertainty(1)[1:].mean())
     assert run.summary.lower_bound == run.world.lower_bound

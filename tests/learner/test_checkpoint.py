@@ -1,4 +1,4 @@
-"""A checkpoint is there whole or not at all, and training goes on from it bit for bit."""
+"""A checkpoint is written whole or not at all, and training resumes from it bit for bit."""
 
 import json
 import logging
@@ -32,7 +32,7 @@ def go_on(path, trainer):
 
 @pytest.fixture
 def trained(small, trainer_of, minibatch_of):
-    """A trainer that has made some updates."""
+    """Return a trainer that has made some updates."""
 
     def make(updates=3, **values):
         trainer = trainer_of(small(values))

@@ -1,4 +1,4 @@
-"""A UAV process is killed again and again in flight: the mission's digest is the undisturbed mission's."""
+"""A UAV process is killed repeatedly in flight: the mission's digest is that of the mission without kills."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files for viewers, made of the logs that real processes leave: the same flight gives the same bytes."""
+"""Files for viewers, made from the logs of real processes: the same flight gives the same bytes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_team_of_processes_and_lock_step_give_the_same_replay_file(
         assert ours.read_bytes() == theirs.read_bytes()
     merged = here("log", "merge", "P", "--prefix", "P/")
     assert merged.returncode == 0, merged.stderr
-    assert set(run_files(tmp_path / "P")) == {"tmc", "uav-000", "uav-001"}  # no derived file is taken for a log
+    assert set(run_files(tmp_path / "P")) == {"tmc", "uav-000", "uav-001"}  # a derived file does not count as a log
     times = [raw.log_time for raw in Log(tmp_path / "P" / "merged.mcap").raw()]
     assert all(a <= b for a, b in pairwise(times))
     sources: Counter[str] = Counter()
@@ -51,7 +51,7 @@ def test_what_a_killed_mission_leaves_can_be_merged_and_replayed(here: Overfly, 
         log, end = tmp_path / "K" / "tmc.mcap.active", time.monotonic() + PATIENCE_S
         while not (log.is_file() and log.stat().st_size > 30_000) and time.monotonic() < end:
             time.sleep(0.05)
-        os.kill(mission.pid, signal.SIGKILL)  # its children die with it
+        os.kill(mission.pid, signal.SIGKILL)  # its children end with it
     made = here("log", "replay", "K")
     assert made.returncode == 0, made.stderr
     assert "was not flown to its end" in made.stderr

@@ -86,7 +86,7 @@ class Uav:
         self.pilot = Pilot(world, 0, incarnation, tracks, ObservationBuilder(world), lambda _: Hovers(), planner)
         client.say(m.Hello("uav", 0, incarnation))
         self.begin = client.hear(m.Begin)
-        self._obey(self.pilot.begin(self.begin))
+        self._obey(self.pilot.on_begin(self.begin))
 
     def _obey(self, wish: m.Message | None) -> None:
         if wish is not None:

@@ -207,5 +207,5 @@ def test_the_command(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "tmc.mcap").write_bytes(next(iter(run_files(flown).values())).read_bytes()[:-50])
     assert cli.main(["log", "merge", str(tmp_path)]) == 1
     said = capsys.readouterr()
-    assert said.err.startswith("overfly: this is not all of it: tmc.mcap: ") and (tmp_path / "merged.mcap").is_file()
+    assert said.err.startswith("overfly: the output is incomplete: tmc.mcap: ") and (tmp_path / "merged.mcap").is_file()
     assert cli.main(["log", "merge", str(tmp_path / "nowhere")]) == 2
