@@ -53,7 +53,7 @@ def _replay(args: argparse.Namespace) -> int:
     out = fresh(args.out) or replay_file.default_path(args.run, args.episode)
     with Line(delay=PROGRESS_DELAY_S) as line:
         made = replay_file.write(args.run, args.episode, out, line.show)
-    flown = made.flown
+    flown = made.timeline
     for note in flown.notes:
         tell(note)
     if flown.damage:

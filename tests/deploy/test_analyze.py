@@ -28,7 +28,7 @@ def test_text_summary_and_pictures(run, capsys):
 def test_json_is_all_of_stdout_and_the_file(run, capsys):
     assert main(["analyze", str(run), "--json", "--no-pictures"]) == 0
     out = capsys.readouterr().out
-    assert json.loads(out)["mission"]["who"] == "planner:greedy"
+    assert json.loads(out)["mission"]["controller"] == "planner:greedy"
     assert (run / "summary.json").read_text() == out
 
 

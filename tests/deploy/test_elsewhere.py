@@ -266,7 +266,7 @@ def test_settings_edited_after_the_run_are_named_and_not_used(flown: Path, tmp_p
     told = here("analyze", "R", "--no-pictures", "--json", cwd=tmp_path)
     summary = json.loads(told.stdout)
     assert told.returncode == 0 and (summary["mission"]["seed"], summary["mission"]["episodes_planned"]) == (1, 1)
-    note = "config.json: training.episodes, training.seed changed since the run, the log's settings are used"
+    note = "config.json: training.episodes, training.seed changed since the run; the log's settings are used"
     assert summary["health"]["notes"] == [note]
     flies = here("evaluate", "R", "--seeds", 1, "--ticks", 5, "--jobs", 1, cwd=tmp_path)
     assert flies.returncode == 0 and flies.stderr == f"overfly: R: {note}\n"

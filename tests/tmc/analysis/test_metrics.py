@@ -104,7 +104,7 @@ def test_a_fixed_mission_means_all_episodes_and_training_the_last_tenth(fly, lea
     assert s.mean.episodes == 2 and not s.mission.learning
     assert s.mean.uncertainty == pytest.approx(np.mean([e.uncertainty for e in s.episodes]))
     t = summary(learned)
-    assert t.mission.learning and t.mission.who == "a policy in training"
+    assert t.mission.learning and t.mission.controller == "a policy in training"
     assert (t.mean.episodes, t.mean.uncertainty) == (1, t.last.uncertainty)
     assert t.best.uncertainty == min(e.uncertainty for e in t.episodes)
     assert t.pace.ticks == 180 and t.pace.updates > 100 and t.pace.loss is not None
@@ -113,7 +113,14 @@ def test_a_fixed_mission_means_all_episodes_and_training_the_last_tenth(fly, lea
 
 def test_mission_says_what_was_planned(fly):
     m = summary(fly(**SCENARIO_1)).mission
-    assert (m.who, m.scenario, m.uavs, m.T_u, m.map, m.seed) == ("planner:greedy", 1, 3, 1, "downtown-toronto", 3)
+    assert (m.controller, m.scenario, m.uavs, m.T_u, m.map, m.seed) == (
+        "planner:greedy",
+        1,
+        3,
+        1,
+        "downtown-toronto",
+        3,
+    )
     assert (m.episodes_flown, m.episodes_planned, m.ticks, m.road_cells) == (2, 2, 60, 323)
 
 
@@ -237,7 +244,7 @@ def test_without_config_json_the_log_has_it(fly, tmp_path):
     assert summary(folder).episodes == summary(fly()).episodes
     for broken in ('{"scenario": 7}', "", "[]"):  # an empty one is what a power cut may leave
         (folder / "config.json").write_text(broken)
-        assert "config.json: no config, the log's is used" in summary(folder).health.notes
+        assert "config.json: not a config; the log's settings are used" in summary(folder).health.notes
         assert summary(folder).episodes == summary(fly()).episodes
     data = bytearray((folder / "tmc.mcap").read_bytes())
     data[data.index(b'"world.map"')] = ord("}")
@@ -258,7 +265,7 @@ def test_the_settings_in_the_log_count_and_the_edited_ones_are_named(fly, tmp_pa
     (folder / "config.json").write_text(json.dumps(config | {"team.size": 2, "training.seed": 99}))
     s = summary(folder)
     assert (s.mission.uavs, s.mission.seed, s.episodes) == (3, 3, summary(fly()).episodes)
-    note = "config.json: team.size, training.seed changed since the run, the log's settings are used"
+    note = "config.json: team.size, training.seed changed since the run; the log's settings are used"
     assert list(s.health.notes) == [note]
     (folder / "config.json").write_text(json.dumps({k: v for k, v in config.items() if k != "training.seed"}))
     assert "config.json: training.seed changed" in summary(folder).health.notes[0]
@@ -273,7 +280,7 @@ def test_the_copy_of_the_map_in_the_run_folder_counts(fly, tmp_path):
     s = summary(folder)
     assert (s.mission.map, s.mission.cell_m, s.health.notes) == ("Old town", 25.0, ())
     (folder / "map.txt").write_text("#########\n#...X...#\n#########\n")
-    assert "map map.txt: changed since the run, the log's is used" in summary(folder).health.notes
+    assert "map map.txt: changed since the run; the log's copy is used" in summary(folder).health.notes
     assert summary(folder).episodes == s.episodes
 
 

@@ -30,7 +30,7 @@ from tmc.analysis import palette
 from tmc.analysis.viewer import replay_file
 from tmc.analysis.viewer.layout import FILE, topics_of
 from tmc.analysis.viewer.messages import SHAPES
-from tmc.analysis.viewer.replay_file import TICK_NS, TRAIL, place
+from tmc.analysis.viewer.replay_file import TICK_NS, TRAIL_TICKS, centre_of
 from tmc.center.journal import Journal
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster
@@ -217,7 +217,7 @@ def test_where_everybody_is(flown: RunData) -> None:
             at = message.pose.position
             assert (message.frame_id, at.x, at.y, at.z) == ("map", 60 * col + 30, 60 * (world.grid.rows - row) - 30, 0)
             if tick and cells[tick, uav] != cells[tick - 1, uav]:
-                before = place(world, cells[tick - 1, uav])
+                before = centre_of(world, cells[tick - 1, uav])
                 yaw = 2 * math.atan2(message.pose.orientation.z, message.pose.orientation.w)
                 towards = math.atan2(at.y - before[1], at.x - before[0])
                 assert math.isclose(math.cos(yaw - towards), 1.0)
@@ -233,7 +233,7 @@ def test_the_scene_shows_each_uav_with_its_trail(flown: RunData) -> None:
         assert [e.id for e in message.entities] == [f"uav-{i}" for i in range(size)] and not message.deletions
         for uav, entity in enumerate(message.entities):
             (line,), (text,) = entity.lines, entity.texts
-            expected = [place(flown.world, cells[t, uav]) for t in range(max(0, tick - TRAIL + 1), tick + 1)]
+            expected = [centre_of(flown.world, cells[t, uav]) for t in range(max(0, tick - TRAIL_TICKS + 1), tick + 1)]
             assert [(p.x, p.y) for p in line.points] == expected
             (body,) = [*entity.spheres, *entity.cubes, *entity.cylinders]
             assert (body.pose.position.x, body.pose.position.y) == expected[-1] and text.text == str(uav)
@@ -389,13 +389,13 @@ def test_a_cut_log_is_replayed_as_far_as_it_goes(together: RunData, tmp_path: Pa
     (long / "tmc.mcap").write_bytes(data[: len(data) // 3])
     made = replay_file.write(long, 1, tmp_path / "cut.mcap")
     found = messages(made.path)
-    assert 20 < made.flown.ticks < 400 and not made.flown.whole
-    assert made.flown.damage is not None and "it is cut" in made.flown.damage
-    assert [t for t, _ in ticks_of(found, "/scene")] == list(range(made.flown.ticks + 1))
+    assert 20 < made.timeline.ticks < 400 and not made.timeline.whole
+    assert made.timeline.damage is not None and "it is cut" in made.timeline.damage
+    assert [t for t, _ in ticks_of(found, "/scene")] == list(range(made.timeline.ticks + 1))
     assert set(found) == set(whole)
     (long / "tmc.mcap").rename(long / "tmc.mcap.active")
-    again = replay_file.write(long, 1, tmp_path / "active.mcap").flown
-    assert (again.damage, again.ticks, again.whole) == (None, made.flown.ticks, False)
+    again = replay_file.write(long, 1, tmp_path / "active.mcap").timeline
+    assert (again.damage, again.ticks, again.whole) == (None, made.timeline.ticks, False)
 
 
 def test_the_same_log_gives_the_same_file(together: RunData, tmp_path: Path) -> None:
@@ -468,8 +468,3 @@ def test_rerun_finds_every_topic_in_order(together: RunData) -> None:
     rows = [line.split() for line in done.stdout.splitlines() if " /" in line]
     assert {row[0] for row in rows} == {"ok"}, done.stdout
     assert {row[3] for row in rows} == set(messages(path))
-
-
-def test_the_colours_are_those_of_the_pictures() -> None:
-    style = pytest.importorskip("tmc.analysis.report.style")
-    assert style.UAV_COLOURS == palette.UAV_COLOURS
