@@ -276,7 +276,7 @@ def open_run(path: StrPath) -> Run:
     >>> overfly.open_run("demo")
     Run('demo')
     """
-    from tmc.record.reader import run_files
+    from tmc.record.run_folder import run_files
 
     run_files(path)
     return Run(path)
@@ -416,19 +416,20 @@ class Run:
                 yield FlightRecord(m.uav, m.episode, m.first, cells, actions, blocks, rewards)
 
     def _logged(self, schema: str) -> Iterator[Any]:
-        from tmc.record.facts import messages
+        from tmc.record.queries import messages
 
         return messages(self.folder, schema)
 
     def messages(self, *topics: str) -> Iterator[LogMessage]:
         """Messages of all logs of the run, one log after the other, of these topics only when given.
 
-        docs/log-format.md lists topics and types.
+        docs/reference/log-format.md lists topics and types.
 
         >>> [m.message.phase for m in overfly.open_run("demo").messages("/tmc/episode")]
         ['begin', 'end']
         """
-        from tmc.record.reader import Log, run_files
+        from tmc.record.reader import Log
+        from tmc.record.run_folder import run_files
 
         for path in run_files(self.folder).values():
             yield from Log(path).entries(topics or None)

@@ -10,14 +10,14 @@ from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
 from tmc.analysis.run_config import settings_of
-from tmc.center.journal import journal_in
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.files import plain
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import PolicyCard, PolicyError
-from tmc.kernel.roadmap import COPY, builtin_maps
+from tmc.kernel.roadmap import builtin_maps
 from tmc.kernel.world import World
+from tmc.record.run_folder import RunFolder
 from tmc.wire import process
 from tmc.wire.capacity import check_policy
 
@@ -53,8 +53,8 @@ def resolve(name: str, say: Callable[[str], None] = process.tell) -> PolicySpec:
 
 def _of_run(folder: Path, say: Callable[[str], None]) -> PolicySpec:
     """The final policy of a run, in the mission that it was trained for."""
-    journal, policy = journal_in(folder), folder / "policies" / "final.onnx"
-    if journal is None and not (folder / "config.json").exists():
+    journal, policy = RunFolder(folder).existing_journal(), RunFolder(folder).final_policy
+    if journal is None and not RunFolder(folder).config.exists():
         raise ConfigError(f"{folder} is no run folder: it has no config.json")
     settings = settings_of(folder, journal)
     for note in settings.notes:
@@ -63,7 +63,7 @@ def _of_run(folder: Path, say: Callable[[str], None]) -> PolicySpec:
     if values["team.controller"] != "policy":
         return PolicySpec(str(folder), None, values)
     if not policy.exists():
-        policy = folder / "policies" / "flown.onnx"
+        policy = RunFolder(folder).fixed_policy
     if not policy.exists():
         raise ConfigError(f"{folder} has no final policy: its training did not end")
     return _of_file(str(folder), policy, values)
@@ -71,7 +71,7 @@ def _of_run(folder: Path, say: Callable[[str], None]) -> PolicySpec:
 
 def _map_of(folder: Path, config: Config) -> dict[str, Any]:
     """The map of a run that flew over a user's map: the copy in its folder, where there is one."""
-    copy = folder / COPY
+    copy = RunFolder(folder).map_copy
     return {"world.map": str(copy)} if config.world.map not in builtin_maps() and copy.exists() else {}
 
 

@@ -21,7 +21,7 @@ from actors.planners import LocalState
 from actors.policy import PolicyController
 from tests.command import PATIENCE_S, here
 from tmc.kernel.observation import ObservationBuilder
-from tmc.record import facts
+from tmc.record import queries
 
 ROOT = Path(__file__).parents[1]
 SMALL: dict[str, Any] = {"replay.learn_start": 8, "dqn.batch_size": 8}
@@ -99,10 +99,10 @@ def test_every_name_is_there() -> None:
 def test_it_gives_what_the_log_holds(flown: overfly.Run) -> None:
     run = overfly.open_run(flown.folder)
     assert run.episodes == (1, 2) and (run.config.team.size, run.config.training.ticks) == (2, 30)
-    rows = list(facts.moves(run.folder, 2))
+    rows = list(queries.moves(run.folder, 2))
     assert run.moves(2).dtype.kind == "i" and run.moves(2).shape == (31, 2)
     assert [(t, i, run.moves(2)[t, i]) for t, i, _ in rows] == rows
-    assert dict(enumerate(run.uncertainty(1).tolist())) == dict(facts.uncertainty(run.folder, 1))
+    assert dict(enumerate(run.uncertainty(1).tolist())) == dict(queries.uncertainty(run.folder, 1))
     assert np.isfinite(run.reward(1)[1:]).all() and run.events(1).shape == (0, 2)
     assert run.metrics["uncertainty"][0] == pytest.approx(run.uncertainty(1)[1:].mean())
     assert run.summary.lower_bound == run.world.lower_bound
@@ -122,7 +122,7 @@ def test_records_are_the_moves(flown: overfly.Run) -> None:
 def test_the_command_does_the_same(place: Path) -> None:
     assert here("fly", "planner:greedy", "--lockstep", "--ticks", 30, "--no-pictures", "--out", "A", cwd=place)
     run = overfly.fly("planner:greedy", out="B", lockstep=True, ticks=30, quiet=True)
-    assert facts.digest("A") == facts.digest(run.folder)
+    assert queries.digest("A") == queries.digest(run.folder)
     told = json.loads((place / "B" / "run.json").read_text())["command"]
     assert told == "overfly.fly('planner:greedy', ticks=30)"
     printed = here("evaluate", "planner:random", "--seeds", 2, "--ticks", 20, "--jobs", 1, cwd=place).stdout

@@ -27,8 +27,6 @@ from tmc.wire import process
 
 ANSWER_S, START_S = 10, 60
 """Time that a message, and a process, may take."""
-ROOM = 200
-"""Characters for the command line of a process."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +112,7 @@ def _processes(config: Config) -> str:
     start = time.monotonic()
     with scratch.made(config) as shared:
         log = shared.folder / "uav.txt"
-        command = forkserver_command("actors", shared.folder, (), ROOM)
+        command = forkserver_command("actors", shared.folder, ())
         server = ForkServer(command, environment("actors", 1), shared.folder / "forkserver.txt")
         try:
             code = server.start("uav-000", ("--help",), log).wait(START_S)

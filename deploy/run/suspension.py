@@ -1,4 +1,4 @@
-"""Ctrl-Z: the processes of a mission stop with the command that looks after them, and go on with it."""
+"""Ctrl-Z: stops the processes of a mission with the command that supervises them, and continues them with it."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class Suspension:
     def _note(self, _number: int, _frame: FrameType | None) -> None:
         self._asked = True
 
-    def take(self) -> None:
-        """Stop all of them and this process, if that was asked for; returns when the shell has them go on."""
+    def suspend_if_asked(self) -> None:
+        """Stop all processes and this one, if Ctrl-Z was pressed; return when the shell continues this process."""
         if not self._asked:
             return
         self._asked = False
@@ -40,7 +40,7 @@ class Suspension:
         _send(reversed(pids), signal.SIGSTOP)
         try:
             signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-            os.kill(os.getpid(), signal.SIGTSTP)  # the system ignores it where no shell could have it go on
+            os.kill(os.getpid(), signal.SIGTSTP)  # the system ignores it if no shell could continue this process
             signal.signal(signal.SIGTSTP, self._note)
         finally:
             _send(pids, signal.SIGCONT)

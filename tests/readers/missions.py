@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from tests.command import LINE, PATIENCE_S, descendants, here, overfly
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.reader import info
@@ -83,14 +83,14 @@ def _records(log: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def resume(left: Path, folder: Path) -> None:
-    """Recover logs as processes do that are started again and have nothing more to say."""
+    """Recover logs as restarted processes do that write no more messages."""
     for active in _copies(left, folder):
         path = active.with_name(active.name.removesuffix(ACTIVE))
-        LogWriter(path, path.stem, Journal(), {}, resume=True).close()
+        LogWriter(path, path.stem, JournalConfig(), {}, resume=True).close()
 
 
 def recover(left: Path, folder: Path) -> None:
-    """Recover logs as a user does; exit code 3 says that something is lost."""
+    """Recover logs as a user does; exit code 3 means that data are lost."""
     _copies(left, folder)
     done = here("log", "recover", folder, "--in-place", cwd=folder)
     assert done.returncode in (0, 3), done.stderr
@@ -102,11 +102,11 @@ def _copies(left: Path, folder: Path) -> list[Path]:
 
 
 def lose_one(out: Path) -> None:
-    """A flight in which one of two UAVs falls silent for so long that the other goes on without it."""
+    """Fly a mission in which one of two UAVs is silent for so long that the other flies on without it."""
     with subprocess.Popen([*LINE, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
         _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
         (silent,) = (
-            p for p in descendants(run.pid) if b"--id\0001\0" in (Path("/proc") / str(p) / "cmdline").read_bytes()
+            p for p in descendants(run.pid) if b"actors --id 1 " in (Path("/proc") / str(p) / "cmdline").read_bytes()
         )
         os.kill(silent, signal.SIGSTOP)
         _await(run, lambda: "/tmc/lost" in info(out / f"tmc.mcap{ACTIVE}").topics)
@@ -115,13 +115,13 @@ def lose_one(out: Path) -> None:
 
 
 def kill_in_flight(out: Path) -> None:
-    """SIGKILL supervisor, TMC, learner and UAVs once each of them has a message in its log."""
+    """Kill supervisor, TMC, learner and UAVs once each of them has a message in its log."""
     with subprocess.Popen([*LINE, *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
         try:
             _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in WRITERS])
             time.sleep(0.5)
         finally:
-            family = [run.pid, *descendants(run.pid)]  # the supervisor first: it would start the others again
+            family = [run.pid, *descendants(run.pid)]  # the supervisor first, since it would restart the others
             for process in family:
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""A UAV process is killed again and again in flight: the mission's digest is the undisturbed mission's."""
+"""A UAV process is killed repeatedly in flight: the mission's digest is that of the mission without kills."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.command import LINE, PATIENCE_S
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 
 
 @pytest.mark.parametrize("options", [(), ("--scenario", "1"), ("--set", "comms.phase=staggered")], ids=str)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, build, differences
-from tmc.kernel.roadmap import COPY, USUAL_CELL_M, MapError, RoadMap, map_of_run, parse_raster
+from tmc.kernel.roadmap import MAP_COPY, USUAL_CELL_M, MapError, RoadMap, map_of_run, parse_raster
 from tmc.kernel.world import World
 from tmc.record.errors import RecordError
-from tmc.record.mcap.parser import DamageError, contents
+from tmc.record.mcap.strict import DamageError, contents
 
 ATTACHED = frozenset(("config.json", "map.csv"))
 """What the TMC attaches at the start of its log."""
@@ -110,7 +110,7 @@ def _map(folder: Path, config: Config, csv: str | None) -> tuple[RoadMap, list[s
         ]
     if csv is None or road_map.csv() == csv:
         return road_map, []
-    name = COPY if road_map.source and (folder / COPY).exists() else world.map
+    name = MAP_COPY if road_map.source and (folder / MAP_COPY).exists() else world.map
     return map_of_csv(world.map, csv, road_map.cell_m), [f"map {name}: changed since the run, the log's is used"]
 
 

@@ -17,8 +17,9 @@ from tmc.kernel.files import read_text
 from tmc.kernel.world import World
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
-from tmc.record.facts import Tracks
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.queries import Tracks
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import run_files
 
 UNKNOWN = -1
 """In `Episode.cells`: the log does not say where the UAV was."""

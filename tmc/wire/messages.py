@@ -1,9 +1,9 @@
 """Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is intact.
 
-`docs/protocol.md` is the text to this table. PolicySpec sends what: UAV -> TMC: Hello, Record, Alive, PolicyRequest,
-Bye. TMC -> UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
-TMC -> learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status.
-UAV -> UAV, passed on by the TMC where the two share no memory: Beacon.
+`docs/reference/protocol.md` is the text to this table. UAV -> TMC: Hello, Record, Alive, PolicyRequest, Bye. TMC ->
+UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye. TMC ->
+learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status. UAV -> UAV, passed on by
+the TMC where the two share no memory: Beacon.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.kernel.limits import SIGHTINGS
+from tmc.kernel.config import MAX_SIGHTINGS
 from tmc.wire import fields as f
 
 PROTOCOL = 1
@@ -100,8 +100,8 @@ class Record(Message):
     actions: Array = f.array("u1", 65_535)
     blocks: Array = f.array("u1", 65_535)
     rewards: Array = f.array("<f4", 65_535)
-    seen_tick: Array = f.array("<u2", SIGHTINGS)
-    seen_cell: Array = f.array("<u2", SIGHTINGS)
+    seen_tick: Array = f.array("<u2", MAX_SIGHTINGS)
+    seen_cell: Array = f.array("<u2", MAX_SIGHTINGS)
     values: Array = f.array("<f4", 131_070, empty=True)
     sent: int = f.integer(0, 2**63 - 1, default=0)
 

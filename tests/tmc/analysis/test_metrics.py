@@ -12,12 +12,12 @@ from deploy.run.lockstep import LockStep
 from tests.tmc.analysis.conftest import flown_as
 from tmc.analysis.metrics import event_waits, summarize, summary
 from tmc.analysis.run_data import read
-from tmc.center.journal import Journal as TmcJournal
-from tmc.kernel.config import Journal, build, flat
+from tmc.center.journal import Journal
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.roadmap import load_map
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
-from tmc.record import facts, schemas
+from tmc.record import queries, schemas
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
@@ -46,10 +46,10 @@ def age_sum(world, moves, ticks):
 def test_uncertainty_is_eq_6_and_the_ratio_that_to_the_bound(fly):
     folder = fly()
     s, world = summary(folder), world_of(folder)
-    expected = age_sum(world, facts.moves(folder, 1), 60)
+    expected = age_sum(world, queries.moves(folder, 1), 60)
     bound = lower_bound(world.alpha, 3, 60)
     assert s.last.uncertainty == pytest.approx(expected, rel=1e-12)
-    assert s.last.uncertainty == pytest.approx(facts.episodes(folder)[-1].uncertainty, rel=1e-12)
+    assert s.last.uncertainty == pytest.approx(queries.episodes(folder)[-1].uncertainty, rel=1e-12)
     assert s.last.per_cell == pytest.approx(expected / 323, rel=1e-12)
     assert s.lower_bound == pytest.approx(bound, rel=1e-12)
     assert s.last.times_bound == pytest.approx(expected / bound, rel=1e-12)
@@ -59,7 +59,7 @@ def test_uncertainty_is_eq_6_and_the_ratio_that_to_the_bound(fly):
 def test_roads_come_from_the_cells_flown(fly):
     folder = fly()
     s, road = summary(folder), set(np.flatnonzero(world_of(folder).map.road).tolist())
-    moves = list(facts.moves(folder, 1))
+    moves = list(queries.moves(folder, 1))
     over = [cell in road for tick, _, cell in moves if tick]
     assert s.last.on_road == pytest.approx(sum(over) / len(over))
     assert s.last.coverage == pytest.approx(len(road & {cell for _, _, cell in moves}) / len(road))
@@ -69,7 +69,7 @@ def test_roads_come_from_the_cells_flown(fly):
 def test_blocked_moves_and_reward_are_those_of_the_episodes(fly):
     folder = fly(**{"training.episodes": 2, "team.size": 12})
     s = summary(folder)
-    ends = [e for e in facts.episodes(folder) if e.phase == "end"]
+    ends = [e for e in queries.episodes(folder) if e.phase == "end"]
     assert (s.blocked_grid, s.blocked_obstacle, s.blocked_uav) == tuple(
         sum(getattr(e, f"blocked_{cause}") for e in ends) for cause in ("grid", "obstacle", "uav")
     )
@@ -83,14 +83,14 @@ def test_events_wait_from_the_slot_they_appear_in_to_the_next_visit(fly):
     folder = fly(**SCENARIO_1)
     s = summary(folder)
     for found in s.episodes:
-        moves = list(facts.moves(folder, found.episode))
-        events = list(facts.events(folder, found.episode))
+        moves = list(queries.moves(folder, found.episode))
+        events = list(queries.events(folder, found.episode))
         waits = [min((t - tick for t, _, c in moves if c == cell and t > tick), default=None) for tick, cell in events]
         done = [w for w in waits if w is not None]
         assert (found.events_appeared, found.events_cleared) == (len(events), len(done))
         assert found.mean_wait == pytest.approx(sum(done) / len(done))
         # What appeared and was not cleared is what is active at the end.
-        assert len(events) - len(done) == dict(facts.uncertainty(folder, found.episode))[60]
+        assert len(events) - len(done) == dict(queries.uncertainty(folder, found.episode))[60]
     assert s.lower_bound is None and s.last.times_bound is None
 
 
@@ -152,7 +152,7 @@ def test_a_cut_log_gives_what_is_sound(long_run, tmp_path):
     assert s.last.episode == 1
     assert any("cut" in note for note in s.health.notes)
     partial = read(folder).episodes[1]
-    whole_curve = [u for _, u in facts.uncertainty(long_run, 2)]
+    whole_curve = [u for _, u in queries.uncertainty(long_run, 2)]
     assert s.episodes[1].uncertainty == pytest.approx(np.mean(whole_curve[1 : partial.ticks + 1]))
 
 
@@ -177,7 +177,7 @@ def test_an_active_log_is_noted_as_such(fly, tmp_path):
 def test_learner_metrics_count_the_last_time_they_were_done(learned, tmp_path):
     folder = copy_of(learned, tmp_path)
     (folder / "learner.mcap").unlink()
-    with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
+    with LogWriter(folder / "learner.mcap", "learner", JournalConfig(), {}) as log:
         for updates, loss in ((10, 1.0), (20, 2.0), (500, 3.0), (20, 7.0)):
             log.write(
                 "/learner/metrics", schemas.LearnerMetrics(updates=updates, loss=loss, q_mean=loss, target_mean=1)
@@ -192,7 +192,7 @@ def test_without_the_learners_log_the_tmc_knows_its_policies(learned, tmp_path):
     folder = tmp_path / "tmc-host"
     folder.mkdir()
     shutil.copy(learned / "config.json", folder)
-    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for version, (updates, loss) in enumerate(((0, 0.0), (100, 0.5), (150, 0.25)), 1):
             log.write("/learner/policy", schemas.Policy(version=version, updates=updates, loss=loss))
         for entry in Log(learned / "tmc.mcap").entries():
@@ -282,7 +282,7 @@ def test_what_is_no_run_is_refused(tmp_path, fly):
         read(tmp_path)
     folder = copy_of(fly(), tmp_path)
     (folder / "tmc.mcap").unlink()
-    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         log.log("info", "nobody came")
     with pytest.raises(RecordError, match="holds no flight"):
         read(folder)
@@ -304,7 +304,7 @@ def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, t
     """UAV 1 is gone from the first episode's start on; with `ticks` 0, so is UAV 0 after the start of the second."""
     config = build({"team.size": 2, "team.controller": "planner:greedy", "training.episodes": 2, "training.ticks": 20})
     (tmp_path / "config.json").write_text(json.dumps(flat(config)))
-    journal = TmcJournal(tmp_path, world := World(config), "run")
+    journal = Journal(tmp_path, world := World(config), "run")
     mission = LockStep(world, None, journal.take)
     for i in (0, 1):
         for to, message in mission._exchange(i, Hello("uav", i, 1)):

@@ -17,12 +17,13 @@ from deploy import cli
 from deploy.run.lockstep import run
 from deploy.run.progress import Progress
 from tests.command import PATIENCE_S
-from tmc.kernel.config import Journal, build, flat
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.merge import NAME, merge
-from tmc.record.reader import Log, run_files
+from tmc.record.reader import Log
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 
 T, N = 30, 3
@@ -56,7 +57,7 @@ def write_logs(folder: Path, times: dict[str, list[int]]) -> dict[str, Path]:
     """Logs of /log messages at given times."""
     folder.mkdir(exist_ok=True)
     for process, ticks in times.items():
-        with LogWriter(folder / f"{process}.mcap", process, Journal(), {}, clock=lambda: 0) as log:
+        with LogWriter(folder / f"{process}.mcap", process, JournalConfig(), {}, clock=lambda: 0) as log:
             for number, tick in enumerate(ticks):
                 text = schemas.message_class("foxglove.Log")(message=f"{process} {number}")
                 log.put("/log", text.SerializeToString(), tick, tick, number)
@@ -104,7 +105,7 @@ def test_messages_of_one_time_stay_in_the_order_of_the_files_and_of_the_file(tmp
 def test_a_file_whose_times_go_back_is_put_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     write_logs(folder, {"tmc": [2, 4]})
-    with LogWriter(folder / "uav-000.mcap", "uav-000", Journal(), {}, clock=lambda: 0) as log:
+    with LogWriter(folder / "uav-000.mcap", "uav-000", JournalConfig(), {}, clock=lambda: 0) as log:
         for topic, tick in (("/log", 3), ("/uav/0/status", 1), ("/log", 5)):
             kind = "foxglove.Log" if topic == "/log" else "overfly.UavStatus"
             log.put(topic, schemas.message_class(kind)().SerializeToString(), tick, tick, int(tick == 5))
@@ -119,14 +120,14 @@ def test_a_prefix_goes_before_each_topic(flown: Path, tmp_path: Path) -> None:
         path = merge(files, tmp_path / "out.mcap", prefix).path
         assert {row[1] for row in of_merged(path)} == {f"/A{row[1]}" for row in of_source(files)}
     for bad in ("a b", "a//b", "é", "a.b"):
-        with pytest.raises(RecordError, match="is no part of a topic"):
+        with pytest.raises(RecordError, match="is not part of a topic"):
             merge(files, tmp_path / "bad.mcap", bad)
     assert not (tmp_path / "bad.mcap").exists()
 
 
 def test_attachments_that_differ_keep_apart(tmp_path: Path) -> None:
     for process, data in (("tmc", b"1"), ("learner", b"2"), ("uav-000", b"1")):
-        with LogWriter(tmp_path / f"{process}.mcap", process, Journal(), {}) as log:
+        with LogWriter(tmp_path / f"{process}.mcap", process, JournalConfig(), {}) as log:
             log.attach("note.txt", "text/plain", data)
     attached = Log(merge(run_files(tmp_path), tmp_path / "out.mcap").path).attachments()
     expected = [("note.txt", b"1"), ("learner/note.txt", b"2"), ("note.txt", b"1")]
@@ -149,7 +150,7 @@ def test_what_is_sound_of_a_cut_file_is_merged_and_the_damage_is_said(flown: Pat
 
 
 def test_a_log_that_is_still_written_is_merged_as_far_as_it_is(tmp_path: Path) -> None:
-    log = LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {})
+    log = LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {})
     try:
         log.log("info", "one")
         log.flush()
@@ -206,5 +207,5 @@ def test_the_command(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "tmc.mcap").write_bytes(next(iter(run_files(flown).values())).read_bytes()[:-50])
     assert cli.main(["log", "merge", str(tmp_path)]) == 1
     said = capsys.readouterr()
-    assert said.err.startswith("overfly: this is not all of it: tmc.mcap: ") and (tmp_path / "merged.mcap").is_file()
+    assert said.err.startswith("overfly: the output is incomplete: tmc.mcap: ") and (tmp_path / "merged.mcap").is_file()
     assert cli.main(["log", "merge", str(tmp_path / "nowhere")]) == 2

@@ -1,4 +1,4 @@
-"""One truth in three places: the table of types, overfly.proto, and docs/log-format.md agree."""
+"""One truth in three places: the table of types, overfly.proto, and docs/reference/log-format.md agree."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from tmc.record import channels, schemas
 from tmc.record.errors import RecordError
 
 PROTO = Path(tmc.record.__file__).with_name("overfly.proto")
-DOC = Path(tmc.record.__file__).parents[2] / "docs" / "log-format.md"
+DOC = Path(tmc.record.__file__).parents[2] / "docs" / "reference" / "log-format.md"
 
 
 def parse(text):
@@ -75,10 +75,10 @@ def test_the_document_shows_the_types():
 
 
 def test_the_example_of_the_document_runs(tmp_path, monkeypatch, capsys):
-    from tmc.kernel.config import Journal  # noqa: PLC0415
+    from tmc.kernel.config import JournalConfig  # noqa: PLC0415
     from tmc.record.writer import LogWriter  # noqa: PLC0415
 
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         log.write("/tmc/metrics", schemas.TeamMetrics(episode=7, first=0, uncertainty=[1.5, 2.5]))
     code, _with_pandas = re.findall(r"```python\n(.*?)```", DOC.read_text(), re.S)
     monkeypatch.chdir(tmp_path)

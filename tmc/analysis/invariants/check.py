@@ -13,7 +13,8 @@ from tmc.analysis.invariants.result import InvariantResult, Violation
 from tmc.analysis.invariants.state import STATE, states
 from tmc.analysis.run_config import world_of
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, LogMessage, run_files
+from tmc.record.reader import Log, LogMessage
+from tmc.record.run_folder import run_files
 
 Law = Callable[[EpisodeLog, Reference], InvariantResult]
 

@@ -17,7 +17,8 @@ from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import run_files
 
 EVERY = 10_000
 """Messages read between two words of progress."""
