@@ -35,7 +35,7 @@ def damage(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_check_prints_a_line_an_invariant(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_a_line_per_invariant(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", "check", str(run)]) == 0
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
@@ -53,7 +53,7 @@ def test_check_of_damage_is_exit_code_1(run: Path, capsys: pytest.CaptureFixture
     assert re.search(r"^file .* VIOLATED: tmc\.mcap: .*, at byte \d+$", out, re.MULTILINE)
 
 
-def test_cat_of_damage_prints_what_is_sound_and_says_that_it_is_not_all(
+def test_cat_of_damage_prints_what_is_intact_and_says_that_it_is_incomplete(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     damage(run / "tmc.mcap")
