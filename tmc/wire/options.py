@@ -1,4 +1,4 @@
-"""The options of every command and child process: whole words only, and errors that cannot move the cursor."""
+"""Parse the options of commands and child processes: no abbreviations, and printable errors."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from tmc.kernel.text import printable
 
 
 class Options(argparse.ArgumentParser):
-    """A parser that takes no abbreviation, which the next new option could turn into another; nor do its commands."""
+    """A parser without abbreviations, since a new option could change their meaning."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{"allow_abbrev": False, **kwargs})
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong on one line, and exit with code 2."""
+        """Print the error on one line, and exit with code 2."""
         super().error(printable(message))
