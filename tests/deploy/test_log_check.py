@@ -79,7 +79,7 @@ def test_recover_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_recover_of_a_file(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, out = run / "tmc.mcap", tmp_path / "mended.mcap"
+    path, out = run / "tmc.mcap", tmp_path / "recovered.mcap"
     path.write_bytes(path.read_bytes()[:-2000])
     assert main(["log", "recover", str(path), "--out", str(out)]) in (0, log_check.LOSS)
     assert Log(out).finished

@@ -111,7 +111,7 @@ def nobody_may_write(folder: Path) -> Iterator[None]:
 
 @pytest.fixture
 def shared() -> Iterator[Path]:
-    """A folder that everybody may read, and new files in it: pytest's own are closed to all but its user."""
+    """A folder that all users may read, and new files in it: pytest's own are closed to all but its user."""
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o755)
         folder = Path(name) / "run"
