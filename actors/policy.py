@@ -44,6 +44,17 @@ def read_card(model: bytes) -> PolicyCard:
     return open_model(model)[1]
 
 
+def run_model(session: Any, observations: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Q of B observations, (B, 3, height, width) float32 -> (B, 9). Raises PolicyError when the model cannot be run."""
+    try:
+        q: np.ndarray[Any, np.dtype[np.float32]] = session.run([OUTPUT], {INPUT: np.ascontiguousarray(observations)})[0]
+    except Exception as error:  # ONNX Runtime raises its own kinds
+        raise PolicyError(f"the model could not be run ({reason(error)})") from None
+    if q.shape != (len(observations), N_ACTIONS):
+        raise PolicyError(f"the model gives values of shape {list(q.shape)}: it must be [{len(observations)}, 9]")
+    return q
+
+
 class PolicyController:
     """argmax_a Q(o, a; theta), over the allowed actions when the policy was trained to mask blocked moves."""
 

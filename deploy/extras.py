@@ -38,7 +38,7 @@ PURPOSES = {
 MODULES = {"pyzmq": "zmq", "protobuf": "google.protobuf", "foxglove-schemas-protobuf": "foxglove_schemas_protobuf"}
 """What is imported, where that is not the package's own name."""
 MISSING = "not installed"
-OURS = {"actors", "deploy", "learner", "tmc", "__main__"}
+OURS = {"actors", "deploy", "learner", "overfly", "tmc", "__main__"}
 _REQUIREMENT = re.compile(r"([\w.-]+?) *>= *([\d.]+) *(?:; *extra *== *['\"]([\w-]+)['\"])?")
 
 

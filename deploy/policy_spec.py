@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,11 @@ class PolicySpec:
     values: dict[str, Any]
 
 
-def resolve(name: str) -> PolicySpec:
-    """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy."""
+def resolve(name: str, say: Callable[[str], None] = process.tell) -> PolicySpec:
+    """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy.
+
+    `say` takes a sentence on each setting of a run folder that was edited since.
+    """
     if name.startswith(PREFIX):
         if name.removeprefix(PREFIX) not in PLANNERS:
             raise ConfigError(f"there is no planner '{name}': choose {', '.join(PREFIX + p for p in PLANNERS)}")
@@ -43,18 +47,18 @@ def resolve(name: str) -> PolicySpec:
         text = f"'{plain(name)}' is no policy file and no run folder: write one of these, or {known}"
         raise ConfigError(text) from None
     if is_folder:
-        return _of_run(Path(name))
+        return _of_run(Path(name), say)
     return _of_file(name, Path(name), {})
 
 
-def _of_run(folder: Path) -> PolicySpec:
+def _of_run(folder: Path, say: Callable[[str], None]) -> PolicySpec:
     """The final policy of a run, in the mission that it was trained for."""
     journal, policy = journal_in(folder), folder / "policies" / "final.onnx"
     if journal is None and not (folder / "config.json").exists():
         raise ConfigError(f"{folder} is no run folder: it has no config.json")
     settings = settings_of(folder, journal)
     for note in settings.notes:
-        process.tell(f"{folder}: {note}")
+        say(f"{folder}: {note}")
     values = dict(flat(settings.config)) | _map_of(folder, settings.config)
     if values["team.controller"] != "policy":
         return PolicySpec(str(folder), None, values)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from tmc.kernel import draws
-from tmc.kernel.config import Config, Network
+from tmc.kernel.config import Config, NetworkConfig
 from tmc.kernel.draws import Stream
 from tmc.kernel.grid import N_ACTIONS
 from tmc.kernel.policy import check_view, features, padding
@@ -29,7 +29,7 @@ class QNet(nn.Module):
     a stride, the convolutions alone would blur which of the cells next to the UAV is which.
     """
 
-    def __init__(self, network: Network, shape: Shape, near: int) -> None:
+    def __init__(self, network: NetworkConfig, shape: Shape, near: int) -> None:
         super().__init__()
         channels, height, width = shape
         self.shape, self.near, self.stride = shape, near, network.stride

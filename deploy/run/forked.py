@@ -38,6 +38,8 @@ class ForkServer:
         self._server: subprocess.Popen[bytes] | None = None
         self._children: dict[str, Forked] = {}
         self._rest = b""
+        self.orphans: set[int] = set()
+        """Processes whose server was lost: where they become children of this process, it must wait for them."""
 
     @property
     def pid(self) -> int | None:
@@ -92,6 +94,8 @@ class ForkServer:
         self._close()
         for child in self._children.values():
             if child.returncode is None:
+                if child.pid is not None:
+                    self.orphans.add(child.pid)
                 child.returncode = code if code < 0 else process.FAILED
         self._children.clear()
 

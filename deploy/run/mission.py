@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +22,7 @@ from deploy.run.progress import Progress, StatusPoller
 from deploy.run.supervisor import MissionFailed, Supervisor
 from tmc.analysis.run_config import attachments, settings_of
 from tmc.center.journal import journal_in
-from tmc.kernel import files, limits
+from tmc.kernel import files, forecast
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.policy import FlightError, check_view, view_shape
 from tmc.kernel.roadmap import COPY
@@ -87,14 +88,14 @@ def _check(world: World, policy: bytes | None, name: str) -> None:
     capacity.check(world, learning=learning)
 
 
-def check_training(config: Config) -> None:
+def check_training(config: Config, say: Callable[[str], None] = process.tell) -> None:
     """Raise ConfigError where nothing would be learned in a whole mission; and say what else will not be done."""
     if policy_spec.is_planner(config):
         return
-    if idle := limits.idle(config):
+    if idle := forecast.idle(config):
         raise ConfigError(idle)
-    for sentence in limits.remarks(config):
-        process.tell(sentence)
+    for sentence in forecast.remarks(config):
+        say(sentence)
 
 
 def needs(config: Config, policy: bytes | None) -> tuple[str, ...]:
@@ -120,8 +121,11 @@ def require_settings(out: Path) -> Config:
     return settings.config
 
 
-def interrupted(out: Path) -> tuple[World, bytes | None]:
-    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError."""
+def interrupted(out: Path, say: Callable[[str], None] = process.tell) -> tuple[World, bytes | None]:
+    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError.
+
+    `say` takes a sentence on what is damaged.
+    """
     config = require_settings(out)
     journal = journal_in(out)
     assert journal is not None
@@ -129,7 +133,7 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
         text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
-        process.tell(f"{text}, and `overfly log recover` says what else is in it")
+        say(f"{text}, and `overfly log recover` says what else is in it")
     file = flown_policy(out)
     policy = files.read_bytes(file) if file.exists() else None
     world = world_of_run(config, out)
@@ -197,8 +201,36 @@ class Mission:
         self._write_run(self._ended)
 
     def run(self, *, in_one_process: bool) -> int:
-        """Fly it; returns the exit code. What it left is in the run folder either way."""
-        code, said = process.DONE, ""
+        """Fly it, and say why when it did not come to its end; returns the exit code. Raises as `fly` otherwise."""
+        try:
+            self.fly(in_one_process=in_one_process)
+        except MissionFailed as failed:
+            self.progress.note(str(failed))
+            return process.FAILED
+        except KeyboardInterrupt as stopped:
+            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+        return process.DONE
+
+    def fly(self, *, in_one_process: bool) -> None:
+        """Fly it to its end. What it left is in the run folder either way.
+
+        Raises MissionFailed; KeyboardInterrupt, once all processes have ended in order; RecordError when the journal
+        cannot be written.
+        """
+        try:
+            self._fly_and_compact(in_one_process=in_one_process)
+        except RecordError:
+            if self._is_there():
+                raise
+            raise MissionFailed(self._gone()) from None
+        except (MissionFailed, FlightError) as failed:
+            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
+            raise MissionFailed(f"{failed}{which}") from None
+        except KeyboardInterrupt:
+            self.progress.note(f"stopped; what was flown is in {self.out}")
+            raise
+
+    def _fly_and_compact(self, *, in_one_process: bool) -> None:
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
@@ -206,22 +238,9 @@ class Mission:
             else:
                 self._fly()
             self._compact()
-        except RecordError:
-            if self._is_there():
-                raise
-            code, said = process.FAILED, self._gone()
-        except (MissionFailed, FlightError) as failed:
-            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
-            code, said = process.FAILED, f"{failed}{which}"
-        except KeyboardInterrupt as stopped:
-            code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-            said = f"stopped; what was flown is in {self.out}"
         finally:
             self._write_run(self._ended)  # first of all: what is said goes to a terminal that may be gone
             self.progress.clear()
-        if said:
-            self.progress.note(said)
-        return code
 
     def _fly(self) -> None:
         mission = plan.make(self.config, self.out, policy=self.policy)

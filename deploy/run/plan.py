@@ -15,7 +15,7 @@ from deploy.run import machine, scratch
 from tmc.kernel.config import Config
 
 ROOT = Path(deploy.__file__).resolve().parent.parent
-"""The folder that holds the four packages."""
+"""The folder that holds overfly.py and the four packages."""
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,16 @@ class Progress:
         self._line.clear()
 
 
+class NoProgress(Progress):
+    """Shows nothing: neither progress nor notes."""
+
+    def show(self, status: m.Status) -> None: ...
+
+    def work(self, what: str, share: float) -> None: ...
+
+    def note(self, text: str) -> None: ...
+
+
 def clock(seconds: float) -> str:
     """Seconds as h:mm:ss or m:ss."""
     minutes, s = divmod(round(seconds), 60)

@@ -129,14 +129,16 @@ class Supervisor:
         return False
 
     def _reap_orphans(self) -> None:
-        """Collect the processes of a forkserver that was killed, where they become zombies of this process."""
-        if not self._adopts:
-            return
-        ours = {server.pid for server in self._forkservers.values()}
-        ours |= {r.handle.pid for r in self.running if isinstance(r.handle, subprocess.Popen)}
-        with suppress(ChildProcessError):
-            while (ended := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)) and ended.si_pid not in ours:
-                os.waitpid(ended.si_pid, 0)
+        """Collect the processes of a forkserver that was killed, where they become zombies of this process.
+
+        No others: this process may be a user's program with children of its own.
+        """
+        for server in self._forkservers.values() if self._adopts else ():
+            for pid in [*server.orphans]:
+                with suppress(ChildProcessError):
+                    if os.waitpid(pid, os.WNOHANG) == (0, 0):
+                        continue  # it has not ended yet
+                server.orphans.discard(pid)
 
     def _left_a_former_life(self, running: _Running) -> bool:
         """Whether it was sent home by an incarnation of the TMC that is over: the next one may need it all the same."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from types import FrameType
@@ -14,13 +15,18 @@ from tmc.wire import process
 class Suspension:
     """Takes note of SIGTSTP, which a terminal sends for Ctrl-Z; respected where the parent has it ignored.
 
+    Does nothing outside of the main thread, which alone may set signal handlers, and where the handler was not set by
+    Python, so that it could not be put back.
+
     `pids`: the processes to stop and to let go on, in the order in which they go on.
     """
 
     def __init__(self, pids: Callable[[], Iterable[int]]) -> None:
         self._pids, self._asked = pids, False
         self._before = signal.getsignal(signal.SIGTSTP)
-        process.handle(signal.SIGTSTP, self._note)
+        self._active = threading.current_thread() is threading.main_thread() and self._before is not None
+        if self._active:
+            process.handle(signal.SIGTSTP, self._note)
 
     def _note(self, _number: int, _frame: FrameType | None) -> None:
         self._asked = True
@@ -41,7 +47,8 @@ class Suspension:
 
     def close(self) -> None:
         """Leave the signal as it was found."""
-        signal.signal(signal.SIGTSTP, self._before)
+        if self._active:
+            signal.signal(signal.SIGTSTP, self._before)
 
 
 def _send(pids: Iterable[int], number: signal.Signals) -> None:

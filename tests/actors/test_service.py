@@ -16,7 +16,7 @@ import zmq
 
 from actors.service import Left, Service, another_mission
 from tests.command import PATIENCE_S
-from tmc.kernel.config import Journal, build, flat
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.world import World
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
@@ -83,7 +83,7 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
 def test_the_log_of_another_mission_is_not_gone_on_with(tmp_path: Path) -> None:
     path = tmp_path / "uav-000.mcap"
     assert not another_mission(path, "a")
-    LogWriter(path, "uav-000", Journal(), {"run": "a"}).close()
+    LogWriter(path, "uav-000", JournalConfig(), {"run": "a"}).close()
     assert not another_mission(path, "a") and another_mission(path, "b")
     path.rename(tmp_path / "uav-000.mcap.active")
     assert another_mission(path, "b")

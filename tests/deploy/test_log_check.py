@@ -108,9 +108,9 @@ def test_seal(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_seal_of_a_run_that_is_alive(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = Log(run / "tmc.mcap").metadata()
-    from tmc.kernel.config import Journal  # noqa: PLC0415
+    from tmc.kernel.config import JournalConfig  # noqa: PLC0415
 
-    with LogWriter(run / "learner.mcap", "learner", Journal(), config):
+    with LogWriter(run / "learner.mcap", "learner", JournalConfig(), config):
         assert main(["log", "compact", str(run)]) == 1
     assert "is being written by another process" in capsys.readouterr().err
 

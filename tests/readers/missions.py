@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from tests.command import LINE, PATIENCE_S, descendants, here, overfly
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.reader import info
@@ -86,7 +86,7 @@ def resume(left: Path, folder: Path) -> None:
     """Recover logs as processes do that are started again and have nothing more to say."""
     for active in _copies(left, folder):
         path = active.with_name(active.name.removesuffix(ACTIVE))
-        LogWriter(path, path.stem, Journal(), {}, resume=True).close()
+        LogWriter(path, path.stem, JournalConfig(), {}, resume=True).close()
 
 
 def recover(left: Path, folder: Path) -> None:

@@ -19,7 +19,7 @@ from deploy.cli import main
 from tests.command import LINE, PATIENCE_S
 from tmc.analysis.invariants.check import check
 from tmc.center.journal import journal_in
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record.facts import digest
 from tmc.record.mcap.parser import frames
 from tmc.record.reader import Log
@@ -156,7 +156,7 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
     empty, anomalies = tmp_path / "empty", tmp_path / "anomalies"
     empty.mkdir()
     anomalies.mkdir()
-    LogWriter(anomalies / "tmc.mcap", "tmc", Journal(), {}).close()
+    LogWriter(anomalies / "tmc.mcap", "tmc", JournalConfig(), {}).close()
     for command, sentence in (
         (("run", "--resume", empty), "holds no journal (tmc.mcap): --resume takes the folder of a run that was begun"),
         (("tmc", "--resume", empty), "holds no journal (tmc.mcap)"),

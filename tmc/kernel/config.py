@@ -1,4 +1,4 @@
-"""The one configuration: every setting with its default, unit and source. Files, options and log metadata follow.
+"""The one configuration: each setting with default, range, unit and source. Files, options and log metadata follow.
 
 The defaults are the paper's (Table I and Sec. IV), so the preset `paper` changes nothing. A setting is named by its
 dotted key, such as `dqn.gamma`; `overfly run --set dqn.gamma=0.95` and the TOML presets use these same keys.
@@ -14,21 +14,33 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from tmc.kernel import limits
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.files import plain
+from tmc.kernel.text import nearest
+
+MAX_SIGHTINGS = 1_000_000
+"""Most sightings of a flight record; the rule of `tmc.wire.messages.Record` is made of it."""
+TRIAL = "trial."
+"""Prefix of the settings that only `overfly verify` changes: they stall UAVs, or lose data by design."""
 
 
-class ConfigError(ValueError):
-    """A setting that cannot be: one sentence with the key and the mend."""
+class ConfigError(OverflyError, ValueError):
+    """A setting that cannot be: one sentence with the key and the fix."""
 
 
-def _s(default: Any, about: str, unit: str = "", source: str = "") -> Any:
-    """A setting: its default, what it is, its unit, and where in the paper (or in our decisions) it comes from."""
-    return field(default=default, metadata={"about": about, "unit": unit, "source": source})
+def _s(
+    default: Any, about: str, unit: str = "", source: str = "", *, low: float | None = None, high: float | None = None
+) -> Any:
+    """Make the field of a setting.
+
+    `about`: what it is, in one sentence; `source`: where in the paper, or in our decisions, the default comes from;
+    `low` and `high`: the range of a number, or of each number of a list, both ends included.
+    """
+    return field(default=default, metadata={"about": about, "unit": unit, "source": source, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
-class World:
+class WorldConfig:
     map: str = _s("downtown-toronto", "built-in map, or a text raster file", source="Sec. IV-A, Fig. 2(a)")
     roads: Literal["major", "main", "arterial", "all"] = _s(
         "main", "which classes of street are monitored", source="Sec. IV-A"
@@ -36,11 +48,12 @@ class World:
     obstacles: Literal["none", "static", "event-day"] = _s(
         "static", "static obstacles and no-fly cells", source="Sec. II-A"
     )
-    alpha: float = _s(0.01, "rate of event arrival in a road cell", "events/tick", "Sec. IV-A")
-    rates: str = _s("uniform", "relative rates by road cell: uniform, volume or blend", source="Sec. IV-A: uniform")
+    alpha: float = _s(0.01, "rate of event arrival in a road cell", "events/tick", "Sec. IV-A", low=1e-9, high=10.0)
+    rates: str = _s("uniform", "relative rates per road cell: uniform, volume or blend", source="Sec. IV-A: uniform")
     alpha_offroad: float = _s(
-        0.0, "rate in cells that are no road", "events/tick", "Sec. II: the roads are what is monitored"
-    )
+        0.0, "rate in cells that are not road", "events/tick", "Sec. II: the roads are what is monitored",
+        low=0.0, high=10.0,
+    )  # fmt: skip
     start: Literal["free", "road"] = _s(
         "free", "cells that UAVs start on, distinct and at random", source="Algorithm 1: random positions"
     )
@@ -50,27 +63,35 @@ class World:
 
 
 @dataclass(frozen=True)
-class Team:
-    size: int = _s(3, "N, the number of UAVs", "UAVs", "Sec. IV-C")
-    controller: str = _s("policy", "who flies: policy, or planner:random, planner:random-road, planner:greedy")
-    sensing_range: float = _s(1.5, "r_s in scenario II", "cell widths d", "Sec. IV-B")
+class TeamConfig:
+    size: int = _s(3, "N, the number of UAVs", "UAVs", "Sec. IV-C", low=1, high=1000)
+    controller: str = _s("policy", "what flies the UAVs: policy, planner:random, planner:random-road or planner:greedy")
+    sensing_range: float = _s(1.5, "r_s in scenario II", "cell widths d", "Sec. IV-B", low=0.0, high=1000.0)
 
 
 @dataclass(frozen=True)
-class Comms:
-    period: int = _s(10, "T_u between two exchanges with the TMC; scenario I always has 1", "ticks", "Sec. II-C")
+class CommsConfig:
+    period: int = _s(
+        10, "T_u between two exchanges with the TMC; scenario I always has 1", "ticks", "Sec. II-C", low=1, high=60_000
+    )
     phase: Literal["together", "staggered"] = _s(
         "together", "all UAVs exchange at t mod T_u = 0, or UAV i at floor(i T_u / N)", source="Algorithm 1; Sec. II-C"
     )
-    silence_warning: float = _s(30.0, "silence after which the TMC names a UAV that others wait for", "s")
-    lost_after: float = _s(60.0, "silence after which it declares it lost, and the others go on without it", "s")
+    silence_warning: float = _s(
+        30.0, "silence after which the TMC names a UAV that others wait for", "s", low=0.1, high=1e6
+    )
+    lost_after: float = _s(
+        60.0, "silence after which the TMC declares a UAV lost; the others continue without it", "s", low=1.0, high=1e6
+    )
 
 
 @dataclass(frozen=True)
-class Reward:
-    collision: float = _s(-20.0, "r^c of a blocked move, instead of any other reward", source="Sec. IV-B")
-    new_cell: float = _s(1.0, "r^n of a cell not visited so far in the episode", source="Sec. IV-B")
-    weight: float = _s(5.0, "lambda, the weight of r^u in eq. (13)", source="Sec. IV-B")
+class RewardConfig:
+    collision: float = _s(
+        -20.0, "r^c of a blocked move, instead of any other reward", source="Sec. IV-B", low=-1e6, high=1e6
+    )
+    new_cell: float = _s(1.0, "r^n of a cell not visited so far in the episode", source="Sec. IV-B", low=-1e6, high=1e6)
+    weight: float = _s(5.0, "lambda, the weight of r^u in eq. (13)", source="Sec. IV-B", low=-1e6, high=1e6)
     uncertainty: Literal["true", "own"] = _s(
         "true", "r^u of the true map, written by the TMC, or of the UAV's own", source="Sec. III-B: r^u = u_k(t)"
     )
@@ -83,111 +104,136 @@ class Reward:
 
 
 @dataclass(frozen=True)
-class Exploration:
-    start: float = _s(0.5, "epsilon in the first episode", source="Table I")
-    end: float = _s(0.05, "epsilon in the last episodes", source="Table I")
-    fraction: float = _s(0.8, "share of the episodes over which epsilon falls linearly", source="left open")
+class ExplorationConfig:
+    start: float = _s(0.5, "epsilon in the first episode", source="Table I", low=0.0, high=1.0)
+    end: float = _s(0.05, "epsilon in the last episodes", source="Table I", low=0.0, high=1.0)
+    fraction: float = _s(
+        0.8, "share of the episodes over which epsilon falls linearly", source="left open", low=0.0, high=1.0
+    )
     mask_blocked: bool = _s(
         False, "never choose a move that is known to be blocked (grid, obstacles, sensed UAVs)", source="ours"
     )
 
 
 @dataclass(frozen=True)
-class Observation:
+class ObservationConfig:
     view: Literal["whole", "ego"] = _s("whole", "the whole grid, or a square around the UAV", source="eq. (12): whole")
-    radius: int = _s(8, "half width of the egocentric view: 2 radius + 1 cells", "cells")
-    near: int = _s(0, "also feed the (2 near + 1)^2 cells around the UAV to the dense layer; 0: off", "cells")
+    radius: int = _s(8, "half width of the egocentric view: 2 radius + 1 cells", "cells", low=1, high=100)
+    near: int = _s(
+        0, "also feed the (2 near + 1)^2 cells around the UAV to the dense layer; 0: off", "cells", low=0, high=100
+    )
 
 
 @dataclass(frozen=True)
-class Network:
-    channels: tuple[int, ...] = _s((16, 32), "filters of each convolution", source="Fig. 2(b), not available")
-    kernel: int = _s(4, "width of the filters", "cells", "Table I")
-    stride: int = _s(2, "stride of the convolutions", "cells", "left open")
-    dense: int = _s(64, "units of the fully connected layer", source="Table I")
+class NetworkConfig:
+    channels: tuple[int, ...] = _s(
+        (16, 32), "filters of each convolution", source="Fig. 2(b), not available", low=1, high=4096
+    )
+    kernel: int = _s(4, "width of the filters", "cells", "Table I", low=1, high=64)
+    stride: int = _s(2, "stride of the convolutions", "cells", "left open", low=1, high=64)
+    dense: int = _s(64, "units of the fully connected layer", source="Table I", low=1, high=65_536)
 
 
 @dataclass(frozen=True)
-class DQN:
-    learning_rate: float = _s(1e-3, "Adam's step size", source="Table I")
-    batch_size: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I")
-    gamma: float = _s(0.99, "discount factor", "1/tick", "Table I")
-    n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (8): 1")
+class DqnConfig:
+    learning_rate: float = _s(1e-3, "Adam's step size", source="Table I", low=1e-12, high=10.0)
+    batch_size: int = _s(128, "b, transitions in a minibatch", "transitions", "Table I", low=1, high=65_536)
+    gamma: float = _s(0.99, "discount factor", "1/tick", "Table I", low=0.0, high=1.0)
+    n_step: int = _s(1, "rewards summed before the bootstrap", "ticks", "eq. (8): 1", low=1, high=1000)
     double: bool = _s(False, "choose a' by the online network (double Q-learning)", source="eq. (8): no")
     loss: Literal["mse", "huber"] = _s("mse", "loss of Q against its target", source="eq. (9)")
-    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (9): 1")
-    target_episodes: int = _s(5, "f: copy theta to theta- every f episodes; 0: off", "episodes", "Table I")
-    target_updates: int = _s(0, "copy theta to theta- every so many updates; 0: off", "updates")
+    reward_scale: float = _s(1.0, "factor on rewards as the learner sees them", source="eq. (9): 1", low=1e-9, high=1e9)
+    target_episodes: int = _s(
+        5, "f: copy theta to theta- every f episodes; 0: off", "episodes", "Table I", low=0, high=1_000_000
+    )
+    target_updates: int = _s(
+        0, "copy theta to theta- every so many updates; 0: off", "updates", low=0, high=1_000_000_000
+    )
 
 
 @dataclass(frozen=True)
-class Replay:
-    capacity: int = _s(100_000, "transitions that the replay memory holds", "transitions", "Table I")
-    learn_start: int = _s(128, "transitions before the first minibatch", "transitions", "left open: b")
-    updates_per_tick: float = _s(1.0, "minibatches a tick of the team", "updates/tick", "Algorithm 1: one")
+class ReplayConfig:
+    capacity: int = _s(
+        100_000, "transitions that the replay memory holds", "transitions", "Table I", low=1, high=1_000_000_000
+    )
+    learn_start: int = _s(
+        128, "transitions before the first minibatch", "transitions", "left open: b", low=1, high=1_000_000_000
+    )
+    updates_per_tick: float = _s(
+        1.0, "minibatches per tick of the team", "updates/tick", "Algorithm 1: one", low=0.0, high=1000.0
+    )
     priority_exponent: float = _s(
-        0.0, "alpha: a transition is drawn in proportion to |TD error|^alpha; 0: all alike", source="eq. (8): all alike"
-    )
+        0.0, "alpha: a transition is drawn in proportion to |TD error|^alpha; 0: uniformly",
+        source="eq. (8): uniform", low=0.0, high=1.0,
+    )  # fmt: skip
     importance_exponent: float = _s(
-        0.4, "beta: weights in the loss that make up for it, in full at 1", source="Schaul et al. 2016, Sec. 3.4"
+        0.4, "beta: weights in the loss that make up for it, in full at 1", source="Schaul et al. 2016, Sec. 3.4",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    error_buffer: int = _s(
+        200, "how far ticks and updates may drift apart before the limiter holds one back", "ticks",
+        low=1, high=1_000_000,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    episodes: int = _s(500, "E, the number of episodes", "episodes", "Table I", low=1, high=10_000_000)
+    ticks: int = _s(1000, "T_ep, the length of an episode", "ticks of 60 s", "Table I", low=1, high=60_000)
+    seed: int = _s(1, "key of every random draw", low=0, high=2**63 - 1)
+    publish_every: int = _s(
+        100, "updates between two policies pushed to the TMC", "updates", "left open", low=1, high=1_000_000_000
     )
-    error_buffer: int = _s(200, "how far ticks and updates may drift apart before the limiter holds one back", "ticks")
+    checkpoint_every: int = _s(5000, "updates between two checkpoints", "updates", low=1, high=1_000_000_000)
+    threads: int = _s(1, "threads of the learner's arithmetic", "threads", low=1, high=1024)
 
 
 @dataclass(frozen=True)
-class Training:
-    episodes: int = _s(500, "E, episodes", "episodes", "Table I")
-    ticks: int = _s(1000, "T_ep, ticks in an episode", "ticks of 60 s", "Table I")
-    seed: int = _s(1, "key of every random draw")
-    publish_every: int = _s(100, "updates between two policies pushed to the TMC", "updates", "left open")
-    checkpoint_every: int = _s(5000, "updates between two checkpoints", "updates")
-    threads: int = _s(1, "threads of the learner's arithmetic", "threads")
-
-
-@dataclass(frozen=True)
-class Journal:
-    flush_interval: float = _s(0.5, "longest time that a logged message stays in the process", "s")
+class JournalConfig:
+    flush_interval: float = _s(0.5, "longest time that a logged message stays in the process", "s", low=0.01, high=60.0)
     commit_interval: float = _s(
-        0.05, "longest time that an accepted flight record waits for the TMC's group commit", "s"
+        0.05, "longest time that an accepted flight record waits for the TMC's group commit", "s", low=0.0, high=60.0
     )
     durability: Literal["process", "power"] = _s(
         "process", "what a committed record survives: kill -9 of the TMC, or a power cut as well (fsync)"
     )
-    chunk: int = _s(262_144, "size of an MCAP chunk before compression", "bytes")
+    chunk: int = _s(262_144, "size of an MCAP chunk before compression", "bytes", low=1024, high=64 * 1024 * 1024)
 
 
 @dataclass(frozen=True)
-class Trial:
-    """What `overfly verify` does to a mission to put its exactness to the test; an ordinary one has none of it."""
+class TrialConfig:
+    """What `overfly verify` does to a mission in order to test it. An ordinary mission has none of it."""
 
-    stall: float = _s(0.0, "how long a UAV's process stalls before it says where it is; 0: never", "s")
-    stall_share: float = _s(1.0, "probability that it stalls at a tick", "1/tick")
-    stall_spread: float = _s(0.0, "stalls last from (1 - spread) to (1 + spread) times as long, at random")
-    stall_uav: int = _s(-1, "the one UAV that stalls; -1: all of them")
-    observation_hash: bool = _s(False, "UAVs log a hash of each observation that they decide on")
-    ack_log: bool = _s(False, "UAVs write down apart which of their records were acknowledged")
-    ack_early: bool = _s(
-        False, "the TMC acknowledges before it has journalled: records get lost, as the trial must see"
+    stall: float = _s(
+        0.0, "how long a UAV's process stalls before it beacons its cell; 0: never", "s", low=0.0, high=60.0
     )
+    stall_share: float = _s(1.0, "probability that it stalls at a tick", "1/tick", low=0.0, high=1.0)
+    stall_spread: float = _s(
+        0.0, "stalls last from (1 - spread) to (1 + spread) times as long, at random", low=0.0, high=1.0
+    )
+    stall_uav: int = _s(-1, "the one UAV that stalls; -1: all of them", low=-1, high=65_535)
+    observation_hash: bool = _s(False, "UAVs log a hash of each observation that they decide on")
+    ack_log: bool = _s(False, "each UAV keeps a file of which of its records were acknowledged")
+    ack_early: bool = _s(False, "the TMC acknowledges records before it has committed them, so some get lost")
 
 
 @dataclass(frozen=True)
 class Config:
     """All settings of a mission. Immutable; `check` has been passed by every instance that `build` returns."""
 
-    scenario: int = _s(2, "1: continuous communication, 2: limited communication", source="Sec. II-B")
-    world: World = field(default_factory=World)
-    team: Team = field(default_factory=Team)
-    comms: Comms = field(default_factory=Comms)
-    reward: Reward = field(default_factory=Reward)
-    exploration: Exploration = field(default_factory=Exploration)
-    observation: Observation = field(default_factory=Observation)
-    network: Network = field(default_factory=Network)
-    dqn: DQN = field(default_factory=DQN)
-    replay: Replay = field(default_factory=Replay)
-    training: Training = field(default_factory=Training)
-    journal: Journal = field(default_factory=Journal)
-    trial: Trial = field(default_factory=Trial)
+    scenario: int = _s(2, "1: continuous communication, 2: limited communication", source="Sec. II-B", low=1, high=2)
+    world: WorldConfig = field(default_factory=WorldConfig)
+    team: TeamConfig = field(default_factory=TeamConfig)
+    comms: CommsConfig = field(default_factory=CommsConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    dqn: DqnConfig = field(default_factory=DqnConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    journal: JournalConfig = field(default_factory=JournalConfig)
+    trial: TrialConfig = field(default_factory=TrialConfig)
 
     @property
     def T_u(self) -> int:
@@ -217,7 +263,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Setting:
-    """One row of the table of settings."""
+    """One row of the table of settings; `low` and `high` are None for what is not a number."""
 
     key: str
     type: Any
@@ -225,6 +271,21 @@ class Setting:
     about: str
     unit: str
     source: str
+    low: float | None
+    high: float | None
+
+    @property
+    def trial(self) -> bool:
+        """True for a setting that only `overfly verify` changes."""
+        return self.key.startswith(TRIAL)
+
+    @property
+    def allowed(self) -> str:
+        """The values that it may have, as text: a range, or choices; empty for names and paths."""
+        if self.low is not None and self.high is not None:
+            return " to ".join(f"{end:,}" if isinstance(end, int) else f"{end:,.10g}" for end in (self.low, self.high))
+        choices = ("true", "false") if self.type is bool else get_args(self.type)
+        return ", ".join(map(str, choices))
 
 
 def _settings(cls: type, prefix: str) -> Iterator[Setting]:
@@ -269,10 +330,20 @@ def build(values: Mapping[str, Any], base: Config | None = None) -> Config:
 def _setting(key: str) -> Setting:
     if key in SETTINGS:
         return SETTINGS[key]
-    last = key.rsplit(".", 1)[-1]
-    near = [k for k in SETTINGS if k.rsplit(".", 1)[-1] == last or k.startswith(f"{key}.")]
-    hint = f"did you mean {' or '.join(near)}?" if near else "`overfly doctor --settings` lists them"
+    hint = f"did you mean {' or '.join(near)}?" if (near := _near(key)) else "`overfly doctor --settings` lists them"
     raise ConfigError(f"there is no setting '{plain(key, 60)}': {hint}")
+
+
+def _near(key: str) -> list[str]:
+    """The settings that may have been meant: of that last word, of that group, or else of a similar name."""
+    known = {k: k.rpartition(".")[2] for k in SETTINGS if not k.startswith(TRIAL)}
+    last = key.rpartition(".")[2]
+    if near := [k for k, name in known.items() if name == last or k.startswith(f"{key}.")]:
+        return near
+    if similar := nearest(key, known):
+        return [similar]
+    name = "" if key.startswith(TRIAL) else nearest(last, known.values())
+    return [k for k in known if name and known[k] == name]
 
 
 def _replace(config: Config, key: str, value: Any) -> Config:
@@ -330,7 +401,35 @@ def _as_int(value: Any) -> int:
 
 
 def check(config: Config) -> None:
-    """Refuse impossible settings; raises ConfigError with the reason and the mend."""
-    reason = limits.broken(config)
-    if reason is not None:
+    """Refuse impossible settings; raises ConfigError with the reason and the fix."""
+    for reason in _out_of_range(config):
         raise ConfigError(reason)
+    for reason in _contradictions(config):
+        raise ConfigError(reason)
+
+
+def _out_of_range(config: Config) -> Iterator[str]:
+    for key, setting in SETTINGS.items():
+        if setting.low is None or setting.high is None:
+            continue
+        value = get(config, key)
+        items = value if isinstance(value, tuple) else (value,)
+        if any(not setting.low <= item <= setting.high for item in items):  # a NaN is in no range
+            yield f"{key} = {plain(value, 60)} is out of range: choose {setting.allowed}"
+
+
+def _contradictions(config: Config) -> Iterator[str]:
+    """What does not go together, though each value is in its range."""
+    near = min(config.team.size, int(2 * config.team.sensing_range + 1) ** 2) - 1
+    if near * (min(config.T_u, config.training.ticks) + 1) > MAX_SIGHTINGS:
+        yield f"a record could hold more than {MAX_SIGHTINGS:,} sightings: lower team.sensing_range, or comms.period"
+    if not config.network.channels:
+        yield "network.channels is empty: list the filters of at least one convolution"
+    if config.replay.learn_start > config.replay.capacity:
+        yield "replay.learn_start is larger than replay.capacity, so learning would never start: lower it"
+    if config.dqn.target_episodes == 0 and config.dqn.target_updates == 0:
+        yield "dqn.target_episodes and dqn.target_updates are both 0, so the target would never follow: raise one"
+    if config.observation.view == "ego" and config.observation.near > config.observation.radius:
+        yield "observation.near is larger than observation.radius: lower it"
+    if config.observation.view == "whole" and config.observation.near:
+        yield "observation.near needs observation.view = ego"

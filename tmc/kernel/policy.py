@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, fields
 
-from tmc.kernel.config import Config, ConfigError, Network, build
+from tmc.kernel.config import Config, ConfigError, NetworkConfig, build
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.files import plain
 from tmc.kernel.grid import N_ACTIONS, Grid
 
@@ -17,7 +18,7 @@ INPUT, OUTPUT = "observation", "q"
 N_CHANNELS = 3
 
 
-class PolicyError(ValueError):
+class PolicyError(OverflyError, ValueError):
     """A policy that cannot fly here: one sentence with the fix."""
 
 
@@ -101,7 +102,7 @@ def view_shape(config: Config, grid: Grid) -> tuple[int, int, int]:
     return N_CHANNELS, grid.rows, grid.cols
 
 
-def features(network: Network, height: int, width: int) -> tuple[int, int]:
+def features(network: NetworkConfig, height: int, width: int) -> tuple[int, int]:
     """Rows and columns after the last convolution, with `padding`; raises ConfigError when a view is too small."""
     if not _sides(network, min(height, width)):
         raise ConfigError(
@@ -113,7 +114,7 @@ def features(network: Network, height: int, width: int) -> tuple[int, int]:
     return rows, cols
 
 
-def padding(network: Network, side: int) -> int:
+def padding(network: NetworkConfig, side: int) -> int:
     """Rows or columns of zeros that are put behind the last one, so that every cell of `side` counts.
 
     Kernels that go in strides may leave some over at the end: of 17 cells, two of 4 by strides of 2 see 14. The paper's
@@ -125,7 +126,7 @@ def padding(network: Network, side: int) -> int:
     return more
 
 
-def _sides(network: Network, side: int) -> list[int]:
+def _sides(network: NetworkConfig, side: int) -> list[int]:
     """What is left of `side` after each convolution; empty when it is too small for one of them."""
     sides = []
     for _ in network.channels:
@@ -136,7 +137,7 @@ def _sides(network: Network, side: int) -> list[int]:
     return sides
 
 
-def _left_over(network: Network, side: int) -> bool:
+def _left_over(network: NetworkConfig, side: int) -> bool:
     """Whether a convolution sees less than all of what it is given."""
     given = [side, *_sides(network, side)[:-1]]
     return any((n - network.kernel) % network.stride for n in given)

@@ -1,6 +1,9 @@
-"""Text that comes from elsewhere, made fit to be shown: names of maps, paths, what a damaged or a foreign log says."""
+"""Text that comes from elsewhere: made fit to be shown, and compared with the names that exist."""
 
 from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
 
 
 def printable(text: object) -> str:
@@ -18,3 +21,16 @@ def _escaped(character: str) -> str:
     if 0xDC80 <= code <= 0xDCFF:  # a byte of a file's name, as `os.fsdecode` keeps it
         return f"\\x{code - 0xDC00:02x}"
     return character.encode("unicode_escape").decode("ascii")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name that is most similar to a mistyped one; empty where none is similar."""
+    lower = {k.lower(): k for k in known}
+    return next((lower[k] for k in difflib.get_close_matches(name.lower(), lower, n=1)), "")
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return how to correct a name that does not exist: the nearest one that does, or else all of them."""
+    known = list(known)
+    near = nearest(name, known)
+    return f"did you mean {near}?" if near else f"choose {', '.join(known)}"

@@ -1,7 +1,9 @@
 """The errors of the flight recorder."""
 
+from tmc.kernel.errors import OverflyError
 
-class RecordError(Exception):
+
+class RecordError(OverflyError):
     """A log that cannot be written or read: one sentence with the mend."""
 
 

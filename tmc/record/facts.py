@@ -23,7 +23,7 @@ Folder = str | os.PathLike[str]
 _UNKNOWN = -1
 
 
-def _messages(folder: Folder, *schemas: str) -> Iterator[Any]:
+def messages(folder: Folder, *schemas: str) -> Iterator[Any]:
     """All messages of these schemas in tmc.mcap, in the order of the log."""
     files = run_files(folder)
     if "tmc" not in files:
@@ -68,7 +68,7 @@ def tracks(folder: Folder) -> dict[int, Tracks]:
     """{episode: tracks} of all flight records, in order of the episodes; a (uav, sequence) counts once."""
     found: dict[int, Tracks] = {}
     known: dict[int, set[int]] = defaultdict(set)
-    for record in _messages(folder, "overfly.FlightRecord"):
+    for record in messages(folder, "overfly.FlightRecord"):
         if record.sequence not in known[record.uav]:
             known[record.uav].add(record.sequence)
             found.setdefault(record.episode, Tracks(record.episode)).add(record)
@@ -97,7 +97,7 @@ def digest(folder: Folder) -> str:
 def uncertainty(folder: Folder, episode: int) -> Iterator[tuple[int, float]]:
     """(tick, sum over cells of the uncertainty of the true map), in order of tick."""
     values: dict[int, dict[int, float]] = defaultdict(dict)
-    for m in _messages(folder, "overfly.TeamMetrics"):
+    for m in messages(folder, "overfly.TeamMetrics"):
         values[m.episode].update(enumerate(m.uncertainty[:], start=m.first))
     _check_held(folder, episode, values)
     return iter(sorted(values[episode].items()))
@@ -106,7 +106,7 @@ def uncertainty(folder: Folder, episode: int) -> Iterator[tuple[int, float]]:
 def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
     """(tick, cell) of each event of scenario I, in that order; none in scenario II."""
     found: dict[int, set[tuple[int, int]]] = defaultdict(set)
-    for m in _messages(folder, "overfly.Events", "overfly.Episode"):
+    for m in messages(folder, "overfly.Events", "overfly.Episode"):
         held = found[m.episode]
         if m.DESCRIPTOR.name == "Events":
             held.update(zip(m.ticks[:], m.cells[:], strict=True))
@@ -116,7 +116,7 @@ def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
 
 def episodes(folder: Folder) -> list[Any]:
     """The overfly.Episode messages, in the order of the log."""
-    return list(_messages(folder, "overfly.Episode"))
+    return list(messages(folder, "overfly.Episode"))
 
 
 def _check_held(folder: Folder, episode: int, held: Collection[int]) -> None:

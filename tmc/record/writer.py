@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import builders, channels, disk, schemas
 from tmc.record.errors import RecordError
 from tmc.record.mcap.writer import mcap_writer
@@ -46,7 +46,7 @@ class LogWriter:
         self,
         path: str | os.PathLike[str],
         process: str,
-        journal: Journal,
+        journal: JournalConfig,
         metadata: Mapping[str, str],
         clock: Callable[[], int] = time.time_ns,
         *,

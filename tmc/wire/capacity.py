@@ -36,7 +36,7 @@ class Need:
 def needs(world: World, *, learning: bool) -> Iterator[Need]:
     """The fields of which a mission's settings and map decide how large they get.
 
-    Sightings of a record are among the limits of the settings (`tmc.kernel.limits`), since they concern every mission.
+    Sightings of a record are among the limits of the settings (`tmc.kernel.config`), since they concern every mission.
     """
     config, cells, ticks = world.config, world.law.cells.size, world.config.training.ticks + 1
     texts = {key: len(json.dumps(value)) for key, value in flat(config).items()}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.kernel.limits import SIGHTINGS
+from tmc.kernel.config import MAX_SIGHTINGS
 from tmc.wire import fields as f
 
 PROTOCOL = 1
@@ -100,8 +100,8 @@ class Record(Message):
     actions: Array = f.array("u1", 65_535)
     blocks: Array = f.array("u1", 65_535)
     rewards: Array = f.array("<f4", 65_535)
-    seen_tick: Array = f.array("<u2", SIGHTINGS)
-    seen_cell: Array = f.array("<u2", SIGHTINGS)
+    seen_tick: Array = f.array("<u2", MAX_SIGHTINGS)
+    seen_cell: Array = f.array("<u2", MAX_SIGHTINGS)
     values: Array = f.array("<f4", 131_070, empty=True)
     sent: int = f.integer(0, 2**63 - 1, default=0)
 

@@ -21,7 +21,7 @@ from deploy.verify.chaos.power import cut_tails
 from deploy.verify.chaos.proxy import Forwarder
 from deploy.verify.chaos.schedule import FaultSchedule, Growth
 from tests.command import PATIENCE_S
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import builders
 from tmc.record.builders import record_digest
 from tmc.record.writer import LogWriter
@@ -40,7 +40,7 @@ def record(uav: int, sequence: int, cell: int = 7) -> m.Record:
 def prepare(out: Path, journalled: list[m.Record], acknowledged: list[m.Record]) -> None:
     """A run folder in which the TMC has journalled these records, and the UAVs have acknowledged to those."""
     (out / "acks").mkdir(parents=True)
-    with LogWriter(out / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(out / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for one in journalled:
             log.write(f"/uav/{one.uav}/record", builders.flight_record(one))
     for one in acknowledged:
@@ -77,7 +77,7 @@ def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same
     prepare(tmp_path, FLOWN[:4], FLOWN[:7])
     snapshot = Snapshot.take(tmp_path)
     (tmp_path / "tmc.mcap").unlink()
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for one in FLOWN:
             log.write(f"/uav/{one.uav}/record", builders.flight_record(one))
     assert check_delivery(tmp_path).lost == 0

@@ -12,7 +12,7 @@ import pytest
 from actors.airspace import Airspace
 from deploy.cli import main
 from deploy.verify import asynchrony, exactness
-from tmc.kernel.config import Journal, build
+from tmc.kernel.config import JournalConfig, build
 from tmc.kernel.grid import Grid
 from tmc.kernel.rastertext import parse_text
 from tmc.record import compare
@@ -93,7 +93,7 @@ def alter(path: Path) -> None:
     """Add a little to the reward of UAV 1 at tick 23."""
     entries = list(read(path))
     path.unlink()
-    with LogWriter(path, "tmc", Journal(), {}) as log:
+    with LogWriter(path, "tmc", JournalConfig(), {}) as log:
         for entry in entries:
             m = entry.message
             if entry.topic == "/uav/1/record" and m.first <= 23 <= m.tick:

@@ -10,7 +10,7 @@ import pytest
 
 from deploy.run.lockstep import run
 from deploy.run.progress import Progress
-from tmc.kernel.config import Journal, build, flat
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas
 from tmc.record.reader import Log
@@ -52,7 +52,7 @@ def flown_as(old: Path, new: Path, change: dict[str, object]) -> None:
     config = next(json.loads(a.data) for a in was.attachments() if a.name == "config.json")
     text = json.dumps(config | change)
     (new / "config.json").write_text(text)
-    with LogWriter(new / "tmc.mcap", "tmc", Journal(), was.metadata()) as log:
+    with LogWriter(new / "tmc.mcap", "tmc", JournalConfig(), was.metadata()) as log:
         for a in was.attachments():
             log.attach(a.name, a.media_type, text.encode() if a.name == "config.json" else a.data)
         for raw in was.raw():
@@ -64,7 +64,7 @@ def learned(fly: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) 
     """A run that looks like training, without torch: three random episodes, and the log of a learner."""
     folder = tmp_path_factory.mktemp("learned") / "run"
     flown_as(fly(**{"training.episodes": 3}), folder, {"team.controller": "policy"})
-    with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
+    with LogWriter(folder / "learner.mcap", "learner", JournalConfig(), {}) as log:
         for n in range(1, 181):
             metrics = schemas.LearnerMetrics(updates=n, loss=1 / n, q_mean=n / 20, target_mean=n / 19)
             log.write("/learner/metrics", metrics)

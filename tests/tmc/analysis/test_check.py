@@ -14,8 +14,8 @@ import pytest
 from actors.airspace import Waiting
 from deploy.run.lockstep import LockStep
 from tmc.analysis.invariants.check import FILE, INVARIANTS, Result, check
-from tmc.center.journal import Journal as TmcJournal
-from tmc.kernel.config import Journal, build, flat
+from tmc.center.journal import Journal
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
@@ -74,7 +74,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(flat(config)))
     world = World(config)
-    journal = TmcJournal(folder, world, "lost")
+    journal = Journal(folder, world, "lost")
     step = LockStep(world, None, journal.take)
     station, pilots = step.station, step.fleet.pilots
     away = False
@@ -160,7 +160,7 @@ def altered(folder: Path, to: Path, change: Change) -> Path:
     to.mkdir()
     shutil.copy(folder / "config.json", to)
     old = Log(folder / "tmc.mcap")
-    with LogWriter(to / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(to / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for attachment in old.attachments():
             log.attach(attachment.name, attachment.media_type, attachment.data)
         for raw in old.raw():
@@ -471,7 +471,7 @@ def test_damage_and_gaps_are_violations(fly: Fly, tmp_path: Path) -> None:
 def test_a_journal_that_lacks_messages_is_caught(fly: Fly, tmp_path: Path) -> None:
     old = Log(fly(**CROWD) / "tmc.mcap")
     shutil.copy(old.path.parent / "config.json", tmp_path)
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for raw in old.raw():
             if not (raw.topic == "/tmc/sync" and raw.sequence == 9):
                 log.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
@@ -482,7 +482,7 @@ def test_a_journal_that_lacks_messages_is_caught(fly: Fly, tmp_path: Path) -> No
 def test_no_journal(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="holds no logs of a run"):
         check(tmp_path)
-    LogWriter(tmp_path / "learner.mcap", "learner", Journal(), {}).close()
+    LogWriter(tmp_path / "learner.mcap", "learner", JournalConfig(), {}).close()
     with pytest.raises(RecordError, match=r"holds no tmc\.mcap"):
         check(tmp_path)
 

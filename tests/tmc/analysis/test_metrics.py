@@ -12,8 +12,8 @@ from deploy.run.lockstep import LockStep
 from tests.tmc.analysis.conftest import flown_as
 from tmc.analysis.metrics import event_waits, summarize, summary
 from tmc.analysis.run_data import read
-from tmc.center.journal import Journal as TmcJournal
-from tmc.kernel.config import Journal, build, flat
+from tmc.center.journal import Journal
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.roadmap import load_map
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
@@ -177,7 +177,7 @@ def test_an_active_log_is_noted_as_such(fly, tmp_path):
 def test_learner_metrics_count_the_last_time_they_were_done(learned, tmp_path):
     folder = copy_of(learned, tmp_path)
     (folder / "learner.mcap").unlink()
-    with LogWriter(folder / "learner.mcap", "learner", Journal(), {}) as log:
+    with LogWriter(folder / "learner.mcap", "learner", JournalConfig(), {}) as log:
         for updates, loss in ((10, 1.0), (20, 2.0), (500, 3.0), (20, 7.0)):
             log.write(
                 "/learner/metrics", schemas.LearnerMetrics(updates=updates, loss=loss, q_mean=loss, target_mean=1)
@@ -192,7 +192,7 @@ def test_without_the_learners_log_the_tmc_knows_its_policies(learned, tmp_path):
     folder = tmp_path / "tmc-host"
     folder.mkdir()
     shutil.copy(learned / "config.json", folder)
-    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for version, (updates, loss) in enumerate(((0, 0.0), (100, 0.5), (150, 0.25)), 1):
             log.write("/learner/policy", schemas.Policy(version=version, updates=updates, loss=loss))
         for entry in Log(learned / "tmc.mcap").entries():
@@ -282,7 +282,7 @@ def test_what_is_no_run_is_refused(tmp_path, fly):
         read(tmp_path)
     folder = copy_of(fly(), tmp_path)
     (folder / "tmc.mcap").unlink()
-    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         log.log("info", "nobody came")
     with pytest.raises(RecordError, match="holds no flight"):
         read(folder)
@@ -304,7 +304,7 @@ def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, t
     """UAV 1 is gone from the first episode's start on; with `ticks` 0, so is UAV 0 after the start of the second."""
     config = build({"team.size": 2, "team.controller": "planner:greedy", "training.episodes": 2, "training.ticks": 20})
     (tmp_path / "config.json").write_text(json.dumps(flat(config)))
-    journal = TmcJournal(tmp_path, world := World(config), "run")
+    journal = Journal(tmp_path, world := World(config), "run")
     mission = LockStep(world, None, journal.take)
     for i in (0, 1):
         for to, message in mission._exchange(i, Hello("uav", i, 1)):

@@ -392,7 +392,7 @@ CONTRADICTIONS: dict[str, tuple[Callable[[list[JournalEntry]], list[JournalEntry
     "of another episode": (lambda es: later_record(es, episode=2), "has a record of episode 2 out of turn"),
     "a jump": (
         lambda es: later_record(es, cells=es[at(es, "/uav/0/record", 2)].values["record"].cells[::-1].copy() * 0 + 1),
-        "the journal contradicts itself, so do not go on with it: record of UAV 0",
+        "the journal contradicts itself, so do not resume from it: record of UAV 0",
     ),
     "an episode is missing": (
         lambda es: es[: at(es, "/tmc/episode", 0)] + es[at(es, "/tmc/episode", 2) :],

@@ -14,8 +14,8 @@ from hypothesis import settings as quick
 from hypothesis import strategies as st
 
 from tmc.kernel.config import SETTINGS, Config, ConfigError, build, check, flat, get
-from tmc.kernel.limits import RANGES
 
+RANGES = [(s.key, s.low, s.high) for s in SETTINGS.values() if s.type in (int, float)]
 QUICK = quick(max_examples=50, deadline=None)
 
 NUMBERS = [s.key for s in SETTINGS.values() if s.type in (int, float)]
@@ -37,11 +37,11 @@ TABLE_I = {
 
 def values_in_range(key: str) -> st.SearchStrategy[Any]:
     """Values that a setting may have, whatever the others are."""
-    setting, ranges = SETTINGS[key], {k: (low, high) for k, low, high in RANGES}
+    setting = SETTINGS[key]
     if setting.type is int:
-        return st.integers(math.ceil(ranges[key][0]), math.floor(ranges[key][1]))
+        return st.integers(setting.low, setting.high)
     if setting.type is float:
-        return st.floats(*ranges[key])
+        return st.floats(setting.low, setting.high)
     if setting.type is bool:
         return st.booleans()
     if get_origin(setting.type) is Literal:
@@ -76,8 +76,27 @@ def test_quantities_have_a_unit(key: str) -> None:
     assert SETTINGS[key].unit
 
 
-def test_every_number_has_a_range_and_every_range_a_number() -> None:
-    assert sorted(key for key, _, _ in RANGES) == sorted(NUMBERS)
+@pytest.mark.parametrize("key", SETTINGS)
+def test_numbers_and_lists_of_them_have_a_range_and_nothing_else(key: str) -> None:
+    """The ends are of the setting's own type, so that what is printed of them can be typed."""
+    setting = SETTINGS[key]
+    kind = {int: int, float: float, tuple[int, ...]: int}.get(setting.type)
+    assert [type(end) for end in (setting.low, setting.high)] == [kind or type(None)] * 2
+    assert kind is None or setting.low < setting.high
+
+
+def test_what_a_setting_may_be_is_said() -> None:
+    assert SETTINGS["team.size"].allowed == "1 to 1,000"
+    assert SETTINGS["dqn.learning_rate"].allowed == "1e-12 to 10"
+    assert SETTINGS["training.seed"].allowed == "0 to 9,223,372,036,854,775,807"
+    assert SETTINGS["dqn.loss"].allowed == "mse, huber"
+    assert SETTINGS["dqn.double"].allowed == "true, false"
+    assert SETTINGS["network.channels"].allowed == "1 to 4,096"
+    assert SETTINGS["world.map"].allowed == ""
+
+
+def test_the_settings_of_trials_are_known_as_such() -> None:
+    assert {s.key.partition(".")[0] for s in SETTINGS.values() if s.trial} == {"trial"}
 
 
 @pytest.mark.parametrize("key", CHOICES)
@@ -175,9 +194,16 @@ def test_a_toml_document_builds() -> None:
         ("gamma", "did you mean dqn.gamma"),
         ("team.gamma", "did you mean dqn.gamma"),
         ("dqn", "dqn.learning_rate"),
-        ("dqn.gama", "overfly doctor --settings"),
+        ("dqn.gama", "did you mean dqn.gamma?"),
+        ("gama", "did you mean dqn.gamma?"),
+        ("DQN.Gamma", "did you mean dqn.gamma?"),
+        ("learning_rte", "did you mean dqn.learning_rate?"),
+        ("training.push_every", "did you mean training.publish_every?"),
+        ("stat", "did you mean world.start or exploration.start?"),
+        ("dqn.gamma.x", "did you mean dqn.gamma?"),
+        ("trial.stall_for", "overfly doctor --settings"),
         ("", "overfly doctor --settings"),
-        ("dqn.gamma.x", "overfly doctor --settings"),
+        ("zzz", "overfly doctor --settings"),
     ],
 )
 def test_unknown_keys_are_refused_with_a_hint(key: str, hint: str) -> None:

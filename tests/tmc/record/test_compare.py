@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import compare, schemas
 from tmc.record.channels import uav_topic
 from tmc.record.errors import RecordError
@@ -21,7 +21,7 @@ Change = Callable[[str, Any], Iterator[Any]]
 def log_of_two(folder: Path) -> Path:
     """Two UAVs, ticks 0 to 4, T_u = 2: scenario-II maps and scenario-I events in one log, as no mission has them."""
     folder.mkdir()
-    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         log.write("/tmc/episode", schemas.Episode(episode=1, phase="begin", starts=[10, 20]))
         for first, tick in ((0, 0), (1, 2), (3, 4)):
             for uav in (0, 1):
@@ -34,7 +34,7 @@ def log_of_two(folder: Path) -> Path:
         log.write("/tmc/events", schemas.Events(episode=1, ticks=[1, 1, 3], cells=[4, 9, 2]))
         log.write("/tmc/episode", schemas.Episode(episode=1, phase="end", ticks=4, reward=[1.0, 2.0]))
     for uav in (0, 1):
-        with LogWriter(folder / f"uav-00{uav}.mcap", f"uav-00{uav}", Journal(), {}) as log:
+        with LogWriter(folder / f"uav-00{uav}.mcap", f"uav-00{uav}", JournalConfig(), {}) as log:
             for first, tick in ((0, 0), (1, 2), (3, 4)):
                 hashes = [100 * uav + t for t in range(max(first, 1) - 1, tick)]
                 message = schemas.ObservationHashes(uav=uav, episode=1, first=first, tick=tick, hashes=hashes)
@@ -64,7 +64,7 @@ def altered(folder: Path, to: Path, change: Change) -> Path:
     """A copy of a run's logs; `change` gives the messages that stand for a message."""
     to.mkdir()
     for name, path in run_files(folder).items():
-        with LogWriter(to / path.name, name, Journal(), {}) as log:
+        with LogWriter(to / path.name, name, JournalConfig(), {}) as log:
             for entry in read(path):
                 for message in change(entry.topic, entry.message):
                     log.write(entry.topic, message)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import compact_run
@@ -24,10 +24,10 @@ from tmc.record.writer import LogWriter
 
 CHILD = """
 import sys, time
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.writer import LogWriter
-log = LogWriter(sys.argv[1], "tmc", Journal(flush_interval=60), {}, resume=sys.argv[2] == "resume")
+log = LogWriter(sys.argv[1], "tmc", JournalConfig(flush_interval=60), {}, resume=sys.argv[2] == "resume")
 log.write("/tmc/sync", schemas.Sync(tick=7))
 log.flush()
 print("writing", flush=True)
@@ -60,26 +60,26 @@ def another_writer(path: Path, how: str = "fresh") -> Iterator[subprocess.Popen[
 def test_a_second_writer_is_refused_while_the_first_lives(tmp_path: Path, how: str) -> None:
     path, active = tmp_path / "tmc.mcap", tmp_path / "tmc.mcap.active"
     if how == "resume":
-        LogWriter(path, "tmc", Journal(), {}).close()
+        LogWriter(path, "tmc", JournalConfig(), {}).close()
     with another_writer(path, how):
         whole = active.read_bytes()
         for _ in range(2):
             with pytest.raises(RecordError, match=r"tmc\.mcap\.active is being written by another process: end that"):
-                LogWriter(path, "tmc", Journal(), {}, resume=True)
+                LogWriter(path, "tmc", JournalConfig(), {}, resume=True)
         with pytest.raises(RecordError, match=r"tmc\.mcap\.active exists already"):
-            LogWriter(path, "tmc", Journal(), {})
+            LogWriter(path, "tmc", JournalConfig(), {})
         for refused in (lambda: recover(active), lambda: compact_run(tmp_path)):
             with pytest.raises(RecordError, match="is being written by another process"):
                 refused()
         assert active.read_bytes() == whole and names(tmp_path) == ["tmc.mcap.active"]
-    with LogWriter(path, "tmc", Journal(), {}, resume=True) as log:  # a kill lets go of it
+    with LogWriter(path, "tmc", JournalConfig(), {}, resume=True) as log:  # a kill lets go of it
         log.write("/tmc/sync", schemas.Sync(tick=8))
     assert [e.message.tick for e in read(path)] == [7, 8]
 
 
 def test_two_that_resume_at_once_do_not_both_get_it(tmp_path: Path) -> None:
     path = tmp_path / "tmc.mcap"
-    LogWriter(path, "tmc", Journal(), {}).close()
+    LogWriter(path, "tmc", JournalConfig(), {}).close()
     command = [sys.executable, "-c", CHILD, str(path), "resume"]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     children = [subprocess.Popen(command, text=True, **pipes) for _ in range(3)]
@@ -136,15 +136,15 @@ def another_user_may_enter(folder: Path) -> bool:
 
 
 def test_a_read_only_folder_is_said_and_keeps_its_logs(shared: Path) -> None:
-    log = LogWriter(shared / "tmc.mcap", "tmc", Journal(), {})
+    log = LogWriter(shared / "tmc.mcap", "tmc", JournalConfig(), {})
     log.write("/tmc/sync", schemas.Sync(tick=1))
     log.flush()
     log._give_up()
     whole = log.active.read_bytes()
     with nobody_may_write(shared):
         for refused in (
-            lambda: LogWriter(shared / "learner.mcap", "learner", Journal(), {}),
-            lambda: LogWriter(shared / "tmc.mcap", "tmc", Journal(), {}, resume=True),
+            lambda: LogWriter(shared / "learner.mcap", "learner", JournalConfig(), {}),
+            lambda: LogWriter(shared / "tmc.mcap", "tmc", JournalConfig(), {}, resume=True),
             lambda: recover(log.active),
             lambda: compact_run(shared),
         ):
@@ -168,7 +168,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_disk_that_is_full(small_disk: Path) -> None:
-    log = LogWriter(small_disk / "tmc.mcap", "tmc", Journal(chunk=4096, flush_interval=60.0), {})
+    log = LogWriter(small_disk / "tmc.mcap", "tmc", JournalConfig(chunk=4096, flush_interval=60.0), {})
     with pytest.raises(RecordError, match="is full: free some space and resume; what was flushed stays readable"):
         for n in range(100_000):
             log.write("/learner/policy", schemas.Policy(version=n, model=os.urandom(1000)))

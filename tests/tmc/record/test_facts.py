@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import facts, schemas
 from tmc.record.channels import uav_topic
 from tmc.record.errors import RecordError
@@ -20,7 +20,7 @@ def record(uav, sequence, episode, first, cells):
 
 def write(folder, records, others=()):
     folder.mkdir(exist_ok=True)
-    with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for r in records:
             log.write(uav_topic(r.uav, "record"), r)
         for topic, message in others:

@@ -17,7 +17,7 @@ from deploy import cli
 from deploy.run.lockstep import run
 from deploy.run.progress import Progress
 from tests.command import PATIENCE_S
-from tmc.kernel.config import Journal, build, flat
+from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.world import World
 from tmc.record import schemas
 from tmc.record.errors import RecordError
@@ -56,7 +56,7 @@ def write_logs(folder: Path, times: dict[str, list[int]]) -> dict[str, Path]:
     """Logs of /log messages at given times."""
     folder.mkdir(exist_ok=True)
     for process, ticks in times.items():
-        with LogWriter(folder / f"{process}.mcap", process, Journal(), {}, clock=lambda: 0) as log:
+        with LogWriter(folder / f"{process}.mcap", process, JournalConfig(), {}, clock=lambda: 0) as log:
             for number, tick in enumerate(ticks):
                 text = schemas.message_class("foxglove.Log")(message=f"{process} {number}")
                 log.put("/log", text.SerializeToString(), tick, tick, number)
@@ -104,7 +104,7 @@ def test_messages_of_one_time_stay_in_the_order_of_the_files_and_of_the_file(tmp
 def test_a_file_whose_times_go_back_is_put_in_order(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     write_logs(folder, {"tmc": [2, 4]})
-    with LogWriter(folder / "uav-000.mcap", "uav-000", Journal(), {}, clock=lambda: 0) as log:
+    with LogWriter(folder / "uav-000.mcap", "uav-000", JournalConfig(), {}, clock=lambda: 0) as log:
         for topic, tick in (("/log", 3), ("/uav/0/status", 1), ("/log", 5)):
             kind = "foxglove.Log" if topic == "/log" else "overfly.UavStatus"
             log.put(topic, schemas.message_class(kind)().SerializeToString(), tick, tick, int(tick == 5))
@@ -126,7 +126,7 @@ def test_a_prefix_goes_before_each_topic(flown: Path, tmp_path: Path) -> None:
 
 def test_attachments_that_differ_keep_apart(tmp_path: Path) -> None:
     for process, data in (("tmc", b"1"), ("learner", b"2"), ("uav-000", b"1")):
-        with LogWriter(tmp_path / f"{process}.mcap", process, Journal(), {}) as log:
+        with LogWriter(tmp_path / f"{process}.mcap", process, JournalConfig(), {}) as log:
             log.attach("note.txt", "text/plain", data)
     attached = Log(merge(run_files(tmp_path), tmp_path / "out.mcap").path).attachments()
     expected = [("note.txt", b"1"), ("learner/note.txt", b"2"), ("note.txt", b"1")]
@@ -149,7 +149,7 @@ def test_what_is_sound_of_a_cut_file_is_merged_and_the_damage_is_said(flown: Pat
 
 
 def test_a_log_that_is_still_written_is_merged_as_far_as_it_is(tmp_path: Path) -> None:
-    log = LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {})
+    log = LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {})
     try:
         log.log("info", "one")
         log.flush()

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, info, read, run_files
@@ -18,7 +18,7 @@ TICKS = 12
 
 
 def make(path, close=True):
-    log = LogWriter(path, "tmc", Journal(flush_interval=60.0), {"seed": "1"}, clock=lambda: 10**18)
+    log = LogWriter(path, "tmc", JournalConfig(flush_interval=60.0), {"seed": "1"}, clock=lambda: 10**18)
     for tick in range(TICKS):
         log.write("/tmc/sync", schemas.Sync(episode=1, tick=tick, uavs=[0, 1, 2], believed=tick / 3))
         if tick % 4 == 3:
@@ -111,7 +111,7 @@ def test_an_active_file_with_a_damaged_stretch_invents_nothing(tmp_path, active,
 def test_a_chunk_that_went_missing_ends_the_reading(tmp_path):
     """A damaged opcode hides a whole chunk: the numbers of the messages show the gap."""
     path = tmp_path / "tmc.mcap"
-    log = LogWriter(path, "tmc", Journal(flush_interval=60.0), {})
+    log = LogWriter(path, "tmc", JournalConfig(flush_interval=60.0), {})
     bounds = []
     for tick in range(3):
         bounds.append((tmp_path / "tmc.mcap.active").stat().st_size)
@@ -128,7 +128,7 @@ def test_a_chunk_that_went_missing_ends_the_reading(tmp_path):
 
 
 def test_topics_are_chosen(tmp_path):
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         log.write("/tmc/sync", schemas.Sync(tick=1))
         log.log("info", "hello")
     assert [e.topic for e in read(tmp_path / "tmc.mcap", ["/log"])] == ["/log"]

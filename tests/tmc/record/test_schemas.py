@@ -75,10 +75,10 @@ def test_the_document_shows_the_types():
 
 
 def test_the_example_of_the_document_runs(tmp_path, monkeypatch, capsys):
-    from tmc.kernel.config import Journal  # noqa: PLC0415
+    from tmc.kernel.config import JournalConfig  # noqa: PLC0415
     from tmc.record.writer import LogWriter  # noqa: PLC0415
 
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         log.write("/tmc/metrics", schemas.TeamMetrics(episode=7, first=0, uncertainty=[1.5, 2.5]))
     code, _with_pandas = re.findall(r"```python\n(.*?)```", DOC.read_text(), re.S)
     monkeypatch.chdir(tmp_path)

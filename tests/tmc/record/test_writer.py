@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import builders, schemas
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, read, run_files
 from tmc.record.writer import LogWriter
 
-LAZY = Journal(flush_interval=60.0)
+LAZY = JournalConfig(flush_interval=60.0)
 
 
 def writer(path, process="tmc", **options):
@@ -135,12 +135,12 @@ def test_a_full_disk_stops_the_log_and_keeps_what_was_flushed(tmp_path):
     """A limit on the file's size stands in for the disk: the write ends half-way, as there."""
     code = f"""
 import resource, signal
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.writer import LogWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-log = LogWriter({str(tmp_path / "tmc.mcap")!r}, "tmc", Journal(flush_interval=60), {{}})
+log = LogWriter({str(tmp_path / "tmc.mcap")!r}, "tmc", JournalConfig(flush_interval=60), {{}})
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 done = 0
 try:
@@ -172,7 +172,7 @@ print(done, first)
 
 def test_flush_is_due_after_the_configured_time(tmp_path):
     now = [0.0]
-    log = LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(flush_interval=0.5), {}, timer=lambda: now[0])
+    log = LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(flush_interval=0.5), {}, timer=lambda: now[0])
     held = lambda: len(list(read(tmp_path / "tmc.mcap.active")))  # noqa: E731
     log.write("/tmc/sync", sync(0))
     log.maybe_flush()
@@ -190,10 +190,10 @@ def test_flush_is_due_after_the_configured_time(tmp_path):
 
 CHILD = """
 import sys
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.writer import LogWriter
-log = LogWriter(sys.argv[1], "tmc", Journal(flush_interval=60), {})
+log = LogWriter(sys.argv[1], "tmc", JournalConfig(flush_interval=60), {})
 for tick in range(10**9):
     log.write("/tmc/sync", schemas.Sync(tick=tick, uavs=range(tick % 7)))
     if tick % 50 == 49:

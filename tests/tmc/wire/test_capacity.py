@@ -10,9 +10,8 @@ import pytest
 
 from deploy.run.supervisor import FINAL
 from learner.trainer import Trainer
-from tmc.kernel.config import ConfigError, build, flat
+from tmc.kernel.config import MAX_SIGHTINGS, ConfigError, build, flat
 from tmc.kernel.grid import Grid
-from tmc.kernel.limits import SIGHTINGS
 from tmc.kernel.policy import PolicyError, policy_bytes, view_shape
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
@@ -80,7 +79,7 @@ def test_every_field_that_settings_fill_is_held_to_its_rule() -> None:
     needs = list(capacity.needs(world, learning=True))
     assert all(need.limit == fields.rules(need.message)[need.field].high for need in needs)
     assert {need.message for need in needs} >= {m.Welcome, m.Begin, m.Map, m.Record, m.PolicyPush, m.Minibatch}
-    assert {fields.rules(m.Record)[name].high for name in ("seen_cell", "seen_tick")} == {SIGHTINGS}
+    assert {fields.rules(m.Record)[name].high for name in ("seen_cell", "seen_tick")} == {MAX_SIGHTINGS}
 
 
 @pytest.mark.parametrize("change", [lambda limit: limit, lambda limit: limit + 1], ids=["the largest", "one more"])

@@ -12,7 +12,7 @@ from typing import IO
 
 from mcap.records import Metadata
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import disk
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import NoLogError, RecordError
@@ -87,7 +87,7 @@ def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show
                 keep(path)
 
         items = chain(_mark(found), salvage(path, "writing what is intact in", show)[1])
-        rewrite.write(target, Journal().chunk, found.profile, items, before_it_is_replaced)
+        rewrite.write(target, JournalConfig().chunk, found.profile, items, before_it_is_replaced)
         if in_place and target != path:
             path.unlink()
     return Recovery(path, target, found)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import CHUNK, compact_run
@@ -22,7 +22,7 @@ Message = tuple[str, str, int, int, int, bytes]
 
 
 def fill(folder: Path, process: str, rounds: int, *, close: bool = True) -> Path:
-    log = LogWriter(folder / f"{process}.mcap", process, Journal(flush_interval=60.0), {"run": "abc"})
+    log = LogWriter(folder / f"{process}.mcap", process, JournalConfig(flush_interval=60.0), {"run": "abc"})
     log.attach("config.json", "application/json", b"{}")
     for n in range(rounds):
         if process == "tmc":
@@ -72,7 +72,7 @@ def test_all_is_kept_and_takes_less(run: Path) -> None:
 
 
 def test_large_logs_get_chunks_of_four_mebibytes(tmp_path: Path) -> None:
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for n in range(5):
             log.write("/learner/policy", schemas.Policy(version=n, model=bytes(2_000_000)))
     compact_run(tmp_path)
@@ -106,7 +106,7 @@ def test_a_damaged_log_is_refused_and_nothing_is_changed(run: Path) -> None:
 def test_a_run_that_is_still_written_is_refused(run: Path) -> None:
     before = (run / "tmc.mcap").read_bytes()
     with (
-        LogWriter(run / "uav-001.mcap", "uav-001", Journal(), {}),
+        LogWriter(run / "uav-001.mcap", "uav-001", JournalConfig(), {}),
         pytest.raises(RecordError, match=r"uav-001\.mcap\.active is being written by another process: end that one"),
     ):
         compact_run(run)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.mcap.recover import recover, recovered_name
@@ -36,7 +36,7 @@ class Whole:
 
 def make(folder: Path, *, close: bool) -> Whole:
     path, chunks, clock = folder / "tmc.mcap", list[tuple[int, int, int, int]](), iter(range(10**9))
-    log = LogWriter(path, "tmc", Journal(flush_interval=60.0), {"seed": "1"}, clock=lambda: next(clock))
+    log = LogWriter(path, "tmc", JournalConfig(flush_interval=60.0), {"seed": "1"}, clock=lambda: next(clock))
     log.attach("config.json", "application/json", b'{"a": 1}')
     written = 0
     for n in range(ROUNDS):
@@ -222,7 +222,7 @@ def test_a_log_that_is_gone_on_with_loses_nothing_in_silence(
     old, copied = write(folder, whole, data), folder / "copy.mcap.active"
     copied.write_bytes(data)
     try:
-        with LogWriter(folder / "tmc.mcap", "tmc", Journal(), {}, resume=True):
+        with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}, resume=True):
             pass
     except RecordError:
         assert old.read_bytes() == data  # it does not begin as a log does
@@ -324,7 +324,7 @@ def test_a_recovered_log_is_resumed_with_its_gap(wholes: dict[bool, Whole], tmp_
     data = bytearray(whole.data)
     data[whole.chunks[4][0] + 60] ^= 1
     recover(write(tmp_path, whole, bytes(data)), in_place=True)
-    with LogWriter(tmp_path / "tmc.mcap", "tmc", Journal(), {}, resume=True) as log:
+    with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}, resume=True) as log:
         log.write("/tmc/sync", schemas.Sync(tick=99))
     again = Log(tmp_path / "tmc.mcap")
     assert len(list(again.raw())) == len(whole.messages) - 6 + 1

@@ -10,14 +10,14 @@ from mcap.opcode import Opcode
 from mcap.records import SummaryOffset
 from mcap.stream_reader import StreamReader
 
-from tmc.kernel.config import Journal
+from tmc.kernel.config import JournalConfig
 from tmc.record.mcap.compact import compact_log
 from tmc.record.mcap.export import Export
 from tmc.record.writer import LogWriter
 
 
 def logged(path: Path) -> None:
-    with LogWriter(path, path.stem, Journal(), {}) as log:
+    with LogWriter(path, path.stem, JournalConfig(), {}) as log:
         log.log("info", "nothing is attached here")
 
 
