@@ -163,10 +163,10 @@ def settings_page() -> str:
     parts = [
         "# Settings\n",
         prose(
-            "Every setting has a dotted name, a default, a range with its unit, and a source. "
-            "`--set replay.capacity=50000` changes one, and a list is written with commas: `--set network.channels=16,32`. The defaults are the paper's; "
-            "where it leaves a point open, the source says so. `overfly doctor --settings --preset NAME` prints them "
-            "as a preset has them."
+            "Every setting has a dotted name, a default, a range with its unit, and a source. `--set "
+            "replay.capacity=50000` changes one, and a list is written with commas: `--set "
+            "network.channels=16,32`. The defaults are the paper's; where it leaves a point open, the source says "
+            "so. `overfly doctor --settings --preset NAME` prints them as a preset has them."
         ),
         "Some settings have an option of their own:\n",
         "| option | setting |\n| --- | --- |",
