@@ -123,7 +123,7 @@ def test_uncounted_cells_get_the_quiet_rate_of_the_file(document: dict[str, Any]
     m = load_map(TORONTO, "all", "none")
     counted = np.array(document["rates"]["volume"], float).ravel()
     missing = m.road & np.isnan(counted)
-    assert missing.sum() == 409 - 381 + 2  # the collectors, and a block of York St that nobody counted
+    assert missing.sum() == 409 - 381 + 2  # the collectors, and a block of York St without a traffic count
     ratio = m.rates["volume"][missing] / m.rates["volume"][m.grid.cell(0, 0)]
     np.testing.assert_allclose(ratio, document["rates"]["uncounted"]["volume"] / counted[0])
 

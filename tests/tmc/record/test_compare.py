@@ -1,4 +1,4 @@
-"""Two logs compared fact by fact: every kind of change is found where it is; what the schedule changes is no fact."""
+"""Two logs compared fact by fact: every kind of change is found where it is; timing is not compared."""
 
 from __future__ import annotations
 

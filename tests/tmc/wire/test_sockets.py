@@ -187,7 +187,7 @@ def test_a_new_process_takes_over_its_name(radio: Radio, endpoint: str) -> None:
 # What cannot be sent
 
 
-def test_a_message_to_nobody_is_not_sent(radio: Radio, endpoint: str) -> None:
+def test_a_message_to_no_client_is_not_sent(radio: Radio, endpoint: str) -> None:
     bound = radio.router(endpoint)
     assert sockets.send(bound, Ack(1), to=b"uav-009") is False
     client = radio.dealer(endpoint, "uav-009")
@@ -232,7 +232,7 @@ def test_an_oversize_part_is_dropped_and_the_others_go_on(radio: Radio, endpoint
 
 
 def test_an_oversize_part_from_the_other_side_does_not_reach_a_client(radio: Radio, ipc: str) -> None:
-    """ZeroMQ gives that connection up for good: a socket opened anew gets through, and nobody else notices."""
+    """ZeroMQ never repairs that connection: a new socket gets through, and no other client is affected."""
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
     other = radio.dealer(ipc, "uav-001")
@@ -370,7 +370,7 @@ def test_what_is_no_endpoint_cannot_be_bound(bad: str, radio: Radio) -> None:
 
 
 def test_a_port_that_does_not_exist_is_refused(radio: Radio) -> None:
-    """ZeroMQ alone takes the port modulo 65,536, so that nobody finds the TMC."""
+    """ZeroMQ alone takes the port modulo 65,536, so that no client finds the TMC."""
     with pytest.raises(EndpointError):
         radio.router("tcp://127.0.0.1:99999")
 
