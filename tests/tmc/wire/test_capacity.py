@@ -1,4 +1,4 @@
-"""What a mission will send is compared with the limits of the messages before it starts; no rule's number is repeated."""
+"""What a mission will send is compared with the limits of its messages before it starts; no limit is repeated here."""
 
 from __future__ import annotations
 
