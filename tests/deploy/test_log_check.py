@@ -43,7 +43,8 @@ def test_check_prints_a_line_per_invariant(run: Path, capsys: pytest.CaptureFixt
     assert len(lines) == 25 and all(re.search(r" [\d,]+  (ok|-)$", line) for line in lines[1:23])
     said = lines[24].removeprefix(f"{run}/tmc.mcap: ")
     assert re.fullmatch(r"1 episode, [\d,]+ facts, all invariants hold in \d+\.\d s", said)
-    assert printed.err == ""
+    progress = r"checked episode 1: \d+%"  # on a machine so slow that the check takes seconds
+    assert all(re.fullmatch(progress, line) for line in printed.err.splitlines())
 
 
 def test_check_of_damage_is_exit_code_1(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

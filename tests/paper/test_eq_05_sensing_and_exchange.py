@@ -1,4 +1,4 @@
-"""Sec. II-C: who is in sensing range, and when a UAV and the TMC exchange what."""
+"""Sec. II-C: which UAVs are in sensing range, and when a UAV and the TMC exchange what."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def test_two_that_resume_at_once_do_not_both_get_it(tmp_path: Path) -> None:
 
 
 @contextmanager
-def nobody_may_write(folder: Path) -> Iterator[None]:
+def unwritable(folder: Path) -> Iterator[None]:
     """The folder is read-only; root gives up its rights for a while, since it may write everywhere."""
     folder.chmod(0o555)
     root = os.geteuid() == 0
@@ -141,7 +141,7 @@ def test_a_read_only_folder_is_said_and_keeps_its_logs(shared: Path) -> None:
     log.flush()
     log._give_up()
     whole = log.active.read_bytes()
-    with nobody_may_write(shared):
+    with unwritable(shared):
         for refused in (
             lambda: LogWriter(shared / "learner.mcap", "learner", JournalConfig(), {}),
             lambda: LogWriter(shared / "tmc.mcap", "tmc", JournalConfig(), {}, resume=True),

@@ -187,7 +187,7 @@ def test_a_new_process_takes_over_its_name(radio: Radio, endpoint: str) -> None:
 # What cannot be sent
 
 
-def test_a_message_to_nobody_is_not_sent(radio: Radio, endpoint: str) -> None:
+def test_a_message_to_no_client_is_not_sent(radio: Radio, endpoint: str) -> None:
     bound = radio.router(endpoint)
     assert sockets.send(bound, Ack(1), to=b"uav-009") is False
     client = radio.dealer(endpoint, "uav-009")
