@@ -16,7 +16,7 @@ from tmc.record.disk import open_log
 from tmc.record.errors import RecordError
 from tmc.record.mcap.export import Export
 from tmc.record.mcap.parser import DamageError, Raw, contents
-from tmc.record.reader import Log
+from tmc.record.reader import Log, require_format
 
 NAME = "overfly/merged"
 """The metadata record that a merged file has more than the files it is made of."""
@@ -109,6 +109,7 @@ def _survey(process: str, path: Path) -> _Source:
     try:
         with open_log(path) as file:
             for item in contents(file):
+                require_format(path, item)
                 if isinstance(item, Attachment):
                     source.attachments.append(item)
                 elif isinstance(item, Metadata):

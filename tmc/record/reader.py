@@ -15,7 +15,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from tmc.record.channels import ACTIVE
+from tmc.record.channels import ACTIVE, FORMAT
 from tmc.record.disk import open_log
 from tmc.record.errors import NoLogError, RecordError
 from tmc.record.mcap.parser import MAGIC, RECOVERED, DamageError, Raw, contents
@@ -37,7 +37,7 @@ class LogMessage:
 
 
 class Log:
-    """One log file. RecordError when it is missing, empty, or no MCAP at all; damage further on is noted instead."""
+    """One log file. RecordError when it is missing, empty, not MCAP, or of another format; damage is noted instead."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -124,12 +124,22 @@ class Log:
             with open_log(self.path) as file:
                 for item in contents(file):
                     finished = item is None
+                    require_format(self.path, item)
                     yield item
         except DamageError as error:
             damage = error
             if error.size and goes_on(self.path, error.at, error.size):
                 damage = DamageError(error.at, "the length of a record is damaged")
         self._damage, self._finished, self._read = damage, finished, True
+
+
+def require_format(path: Path, item: list[Raw] | Metadata | Attachment | None) -> None:
+    """Raise RecordError if an item of a log is metadata that states another version of the log format."""
+    if isinstance(item, Metadata) and item.name.startswith("overfly/"):
+        found = item.metadata.get("format", FORMAT)
+        if found != FORMAT and found.isdecimal():  # anything else is damage, which is noted as such
+            fix = "use the version of Overfly that wrote it"
+            raise RecordError(f"{path} was written in log format {found[:20]}, this version reads {FORMAT}: {fix}")
 
 
 def _check_start(path: Path) -> None:

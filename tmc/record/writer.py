@@ -20,9 +20,6 @@ from tmc.record import builders, channels, disk, schemas
 from tmc.record.errors import RecordError
 from tmc.record.mcap.writer import mcap_writer
 
-FORMAT = "1"
-"""Version of the log format, in the metadata of each file."""
-
 
 @dataclass(slots=True)
 class _Channel:
@@ -84,7 +81,7 @@ class LogWriter:
 
                 resume.copy(old, self)
             # Names are unique to the process, so that the files of a run can be merged.
-            facts = {"format": FORMAT, "process": self.process, "clock": "wall"}
+            facts = {"format": channels.FORMAT, "process": self.process, "clock": "wall"}
             self.note(f"overfly/{self.process}", facts | metadata)
             self.flush(fsync=old is not None)
             if old is not None:
