@@ -9,9 +9,11 @@ import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from tmc.wire import process
 from tmc.wire.options import Options
@@ -97,12 +99,15 @@ def check_install() -> None:
         raise ConfigError(f"the packages of Overfly lie in different folders ({', '.join(sorted(roots))}): reinstall")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
+def main(argv: list[str] | None = None, trial: Mapping[str, Any] | None = None) -> int:
+    """Run one command; returns the exit code.
+
+    `trial`: settings `trial.*` of the mission. They stall UAVs or lose data by design, so no option sets them.
+    """
     process.standard_streams()
     process.inherited_signals()
     try:
-        return _main(argv)
+        return _main(argv, trial or {})
     except Exception as error:
         from deploy import extras  # noqa: PLC0415  only where something is wrong
 
@@ -113,12 +118,13 @@ def main(argv: list[str] | None = None) -> int:
         return process.USAGE
 
 
-def _main(argv: list[str] | None) -> int:
+def _main(argv: list[str] | None, trial: Mapping[str, Any]) -> int:
     # While modules are imported nothing is worth an orderly end: Ctrl-C ends the process, without a traceback.
     process.handle(signal.SIGINT, signal.SIG_DFL)
     argv = sys.argv[1:] if argv is None else argv
     chosen = next((a for a in argv if not a.startswith("-")), None)
     args = parser_for(chosen).parse_args(argv)
+    args.trial = dict(trial)
     module = importlib.import_module(next(c.module for c in COMMANDS if c.name == args.command))
 
     def run() -> int:

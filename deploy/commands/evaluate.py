@@ -111,10 +111,8 @@ def missions(args: argparse.Namespace) -> Iterator[tuple[str, Config, bytes | No
     shared = shared_world(pilots, {*settings.chosen(args), *(["team.size"] if args.actors else [])})
     for pilot in pilots:
         for n in team_sizes(args.actors):
-            values = {**pilot.values, **shared, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
-            values |= {"team.controller": pilot.values["team.controller"]}
-            values |= {} if n is None else {"team.size": n}
-            config = build(values)
+            size = {} if n is None else {"team.size": n}
+            config = build(policy_spec.mission_values(pilot, shared, settings.chosen(args), size))
             check(config, pilot.policy, pilot.name)
             for seed in range(args.first_seed, args.first_seed + args.seeds):
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy

@@ -14,7 +14,7 @@ from tmc.kernel.config import build
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("who", help="policy file, run folder, or planner:random, planner:random-road, planner:greedy")
-    settings.add_options(parser)
+    settings.add_options(parser, defaults=policy_spec.ONE_EPISODE)
     add_mission_options(parser)
 
 
@@ -22,13 +22,7 @@ def main(args: argparse.Namespace) -> int:
     """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
     extras.require()
     pilot = policy_spec.resolve(args.who)
-    values = {
-        **pilot.values,
-        "training.episodes": 1,
-        **policy_spec.FIXED,
-        **settings.chosen(args),
-        **policy_spec.pilot_of(pilot),
-    }
+    values = policy_spec.mission_values(pilot, settings.chosen(args))
     world = mission.check(build(values), pilot.policy, pilot.name)
     if not args.lockstep:
         plan.check_machine(world.config, learns=False, out=args.out)

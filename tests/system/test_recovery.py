@@ -16,7 +16,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from deploy.cli import main
-from tests.command import LINE, PATIENCE_S
+from tests.command import LINE, PATIENCE_S, line_of_trial
 from tmc.analysis.invariants.check import check
 from tmc.center.journal import journal_in
 from tmc.kernel.config import JournalConfig
@@ -28,21 +28,22 @@ from tmc.record.writer import LogWriter
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 Running = Callable[[str], list[int]]
 FLIGHT = ("fly", "planner:greedy", "--actors", "3", "--ticks", "500", "--seed", "7", "--no-pictures")
-SLOW = ("--set", "trial.stall=0.01", "--set", "trial.stall_share=1.0")
+SLOW = line_of_trial(stall=0.01)
 """Every UAV stalls a little, so that the mission lasts long enough to be killed in."""
 
 
 @pytest.fixture(scope="module")
-def finish(tmp_path_factory: pytest.TempPathFactory) -> str:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The digest of the flight when nobody disturbs it."""
-    out = tmp_path_factory.mktemp("calm") / "R"
+    out = tmp_path_factory.mktemp("undisturbed") / "R"
     assert main([*FLIGHT, "--lockstep", "--out", str(out)]) == 0
     return digest(out)
 
 
-def begin(tmp_path: Path, *command: str) -> subprocess.Popen[str]:
-    line = [*LINE, *command]
-    return subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+def begin(tmp_path: Path, *command: str, line: tuple[str, ...] = LINE) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*line, *command], cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
 
 
 def wait_for(what: Callable[[], object], run: subprocess.Popen[str]) -> None:
@@ -78,9 +79,9 @@ def kill_all(run: subprocess.Popen[str], running: Running, out: Path) -> None:
         time.sleep(0.02)
 
 
-def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, calm: str, tmp_path: Path) -> None:
+def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, undisturbed: str, tmp_path: Path) -> None:
     out, draw, kills = tmp_path / "R", random.Random(5), 0
-    with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
+    with begin(tmp_path, *FLIGHT, "--out", str(out), line=SLOW) as run:
         while kills < 5:
             before = records(out)
             wait_for(lambda before=before: records(out) > before, run)
@@ -93,16 +94,16 @@ def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, calm
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert errors.count("tmc was killed by SIGKILL; it is started again") == 5
-    assert digest(out) == calm and check(out).good
+    assert digest(out) == undisturbed and check(out).good
     said = [e.message.message for e in Log(out / "tmc.mcap").entries(["/log"])]
     assert sum("the TMC was started again and goes on from tick" in text for text in said) == 5
 
 
 def test_a_flight_goes_on_after_everything_was_killed(
-    overfly: Overfly, here: Overfly, running: Running, calm: str, tmp_path: Path
+    overfly: Overfly, here: Overfly, running: Running, undisturbed: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "R"
-    with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
+    with begin(tmp_path, *FLIGHT, "--out", str(out), line=SLOW) as run:
         wait_for(lambda: records(out) > 40, run)
         busy = here("run", "--resume", out)
         assert busy.returncode == 2 and "is being written by another process: end that one first" in busy.stderr
@@ -111,7 +112,7 @@ def test_a_flight_goes_on_after_everything_was_killed(
     again = overfly("run", "--resume", out, "--no-pictures")
     assert again.returncode == 0, again.stderr
     assert "Uncertainty" in again.stdout
-    assert digest(out) == calm and check(out).good
+    assert digest(out) == undisturbed and check(out).good
     told = json.loads((out / "run.json").read_text())
     assert set(told["exit_codes"].values()) == {0} and told["compacted"]["after"] > 0
     # Finished now: nothing is flown again, and the summary is said.
