@@ -4,17 +4,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN ?= runs/demo-$(shell date -u +%Y%m%d-%H%M%S)
 
-.PHONY: demo test explore check lint clean
+.PHONY: demo test explore check lint docs clean
 
 # The main job: three UAV processes, the TMC and the learner on downtown Toronto; then the policy against the baselines.
 demo: $(VENV)/.run
 	$(BIN)/overfly run quick --out $(RUN)
-	$(BIN)/overfly evaluate $(RUN) planner:random-road planner:random --seeds 5
+	$(BIN)/overfly evaluate $(RUN) planner:greedy planner:random-road planner:random --seeds 5
 
 test: $(VENV)/.dev $(VENV)/.readers
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-# The properties with examples that nobody has seen yet. A failure names the example: make it a test of its own.
+# The properties with new random examples. A failure names the example: make it a test of its own.
 explore: $(VENV)/.dev
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m hypothesis --hypothesis-profile explore
 
@@ -24,7 +24,12 @@ lint: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-check: lint test
+# The site, in build/docs: the pages that follow from the code are written first; a warning or a broken link is an error.
+docs: $(VENV)/.docs
+	$(BIN)/python docs/generate.py
+	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs
+
+check: lint docs test
 
 $(VENV)/bin/pip:
 	$(PYTHON) -m venv $(VENV)
@@ -38,6 +43,10 @@ $(VENV)/.run: pyproject.toml constraints.txt | $(VENV)/bin/pip
 
 $(VENV)/.dev: $(VENV)/.run
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.run
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	@touch $@
 
 # What others read our logs with, for tests/readers. What cannot be had here is left out: its tests skip, and say why.

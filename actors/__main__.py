@@ -10,7 +10,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from actors.service import Left, Service
+from actors.service import FlightEnded, Service
 from tmc.kernel.config import ConfigError
 from tmc.kernel.policy import PolicyError
 from tmc.kernel.roadmap import MapError
@@ -25,16 +25,16 @@ MISTAKES = (ConfigError, MapError, PolicyError, RecordError, EndpointError, Fiel
 
 
 def fly(uav: int, endpoint: str, out: Path) -> int:
-    """Fly UAV `uav` until its TMC ends the mission; returns the exit code."""
+    """Fly UAV `uav` until its TMC ends the mission; return the exit code. Raises MISTAKES."""
     stop = process.Stop()
     service = Service(uav, endpoint, out)
     try:
         service.fly(stop)
-    except Left as left:
-        service.leave(printable(left))
-        if left.code not in {process.DONE, process.STOPPED}:
-            process.tell(f"UAV {uav}: {left}")
-        return stop.code if left.code == process.STOPPED else left.code
+    except FlightEnded as end:
+        service.leave(printable(end))
+        if end.code not in {process.DONE, process.STOPPED}:
+            process.tell(f"UAV {uav}: {end}")
+        return stop.code if end.code == process.STOPPED else end.code
     except PolicyError as error:
         service.leave(str(error))
         raise
@@ -43,12 +43,12 @@ def fly(uav: int, endpoint: str, out: Path) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse the options of a child process and fly."""
+    """Parse the options of a child process, fly, and return the exit code."""
     parser = Options("actors", description=__doc__)
     parser.add_argument("--id", type=int, required=True, help="number of the UAV, from 0")
     parser.add_argument("--connect", required=True, help="the TMC's endpoint for UAVs")
     parser.add_argument("--out", type=Path, required=True, help="folder for the UAV's log")
-    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
     a = parser.parse_args(argv)
     process.become_child(a.parent)
     return process.run_child(lambda: fly(a.id, a.connect, a.out), MISTAKES)

@@ -1,4 +1,4 @@
-"""A policy file as it came: what else it may be, whether its model has what it declares, and why it was refused."""
+"""Checks a policy file before it flies: is it an ONNX model of one piece, and does it have the shapes of its card?"""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tmc.wire.capacity import check_policy
 _EXPORT = "export it to ONNX, as policies/final.onnx of a run is"
 _UNPACK = "unpack it first"
 _OUTSIDE = b"\n\x08location\x12"
-"""How ONNX names the file outside of the model that holds a weight: key and value of TensorProto.external_data."""
+"""The key of TensorProto.external_data under which ONNX names a file outside the model that holds a weight."""
 
 
 def _begins(*starts: bytes) -> Callable[[bytes], bool]:
@@ -22,7 +22,7 @@ def _begins(*starts: bytes) -> Callable[[bytes], bool]:
 
 
 def _is_text(data: bytes) -> bool:
-    """Whether it begins as plain text does; a model begins with the number of a field."""
+    """Return whether the data begin as plain text does; a model begins with the number of a field."""
     return all(32 <= byte < 127 or byte in b"\t\r\n" for byte in data[:64])
 
 
@@ -46,11 +46,11 @@ KINDS: tuple[tuple[Callable[[bytes], bool], str], ...] = (
     (lambda data: _OUTSIDE in data,
      "the weights of the ONNX model lie in another file: export it again with them inside (external_data=False)"),
 )  # fmt: skip
-"""What else a file may be, or how its model cannot be used, by its bytes; and what to do about it."""
+"""(test of the bytes, sentence with cause and fix) for each kind of file that cannot be used as a policy."""
 
 
 def check_kind(model: bytes) -> None:
-    """Raise PolicyError for a file that is known to be something else than a model of one piece."""
+    """Raise PolicyError for a file that is known not to be an ONNX model of one piece."""
     check_policy(len(model))
     for is_kind, sentence in KINDS:
         if is_kind(model):
@@ -58,7 +58,7 @@ def check_kind(model: bytes) -> None:
 
 
 def reason(error: Exception) -> str:
-    """Why ONNX Runtime would not have it, as a part of a sentence: without where in its source it says so."""
+    """Return why ONNX Runtime refused a model, as part of a sentence, without file names and lines of its source."""
     text = plain(error, 2000)
     text = re.sub(r"\[ONNXRuntimeError\] : \d+ : \w+ :", " ", text)
     text = re.sub(r"\S*/\S+\.(cc|h):\d+ .*?\)(?= [A-Z])", " ", text)  # the place, and the signature of the function
@@ -69,7 +69,7 @@ def reason(error: Exception) -> str:
 def check_shapes(session: Any, card: PolicyCard) -> None:
     """Raise PolicyError unless the model takes INPUT alone and gives OUTPUT, with the types and shapes of its card.
 
-    A size that the model leaves open fits; what else the model would give is not asked for.
+    A dimension that the model leaves open fits. Other outputs of the model are ignored.
     """
     inputs = {given.name: given for given in session.get_inputs()}
     outputs = {given.name: given for given in session.get_outputs()}
@@ -82,7 +82,7 @@ def check_shapes(session: Any, card: PolicyCard) -> None:
 
 
 def _check_shape(given: Any, shape: tuple[int, ...]) -> None:
-    """Whether an input or an output can be a float32 tensor of this shape."""
+    """Raise PolicyError unless an input or output can be a float32 tensor of this shape."""
     name, sides = given.name, list(given.shape)
     if given.type != "tensor(float)":
         raise PolicyError(f"the model's '{name}' is a {plain(given.type, 40)}: it must be a tensor(float), of float32")

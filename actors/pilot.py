@@ -1,8 +1,11 @@
-"""One UAV as a core without I/O: it senses, ships its record when due, decides, moves, and says what it must wait for.
+"""One UAV as a core without I/O: it senses, ships its record when due, decides, moves, and names what it waits for.
 
-Per tick t, in this order (docs/architecture.md): sense the peers near it and update the own map; at t mod T_u = phase
-ship the record and merge the TMC's map; observe o(t) and choose a(t); move, unless the target is held; the new cell is
-visited at t + 1.
+Per tick t, in this order (docs/explanation/architecture.md):
+
+1. Sense the peers nearby and update its own map.
+2. At t mod T_u = phase, ship the record and merge the TMC's map.
+3. Observe o(t) and choose a(t).
+4. Move, unless the target is held. The new cell is visited at t + 1.
 """
 
 from __future__ import annotations
@@ -26,15 +29,15 @@ from tmc.wire.messages import EMPTY, Begin, Lost, Map, Policy, PolicyRequest, Re
 
 NONE: NDArray[np.float32] = np.zeros(0, "<f4")
 MAX_TICKS_PER_ADVANCE = 32
-"""Ticks that a pilot flies at most before it looks up."""
+"""Most ticks that one call of `advance` flies."""
 
 
 class LostRecordsError(Exception):
-    """The TMC has lost what it had acknowledged; only a new process can take the flight up again."""
+    """The TMC has lost records that it had acknowledged. Only a new process can resume the flight."""
 
 
 class Phase(Enum):
-    """What the pilot does next, or waits for."""
+    """What the pilot does next, or what it waits for."""
 
     IDLE = "waits for an episode"
     POLICY = "waits for a policy"
@@ -46,7 +49,7 @@ class Phase(Enum):
 
 @dataclass
 class RecordBuilder:
-    """What was flown since the last record."""
+    """The moves since the last record; its fields are those of `Record`. `seen`: (tick, cell) of sensed peers."""
 
     first: int
     cells: list[int] = field(default_factory=list)
@@ -58,9 +61,10 @@ class RecordBuilder:
 
 
 class Pilot:
-    """UAV `uav` of a world. `make_controller` turns the bytes of a policy file into a Controller; a planner needs none.
+    """UAV `uav` of a world.
 
-    `clock`: the wall clock in ns that records are stamped with; 0 where there is none.
+    `make_controller` turns the bytes of a policy file into a Controller; with a `planner` it is not used. `clock`: the
+    wall clock (ns) that records are stamped with; 0 without one.
     """
 
     def __init__(
@@ -80,28 +84,31 @@ class Pilot:
         self.reward, self._clock = RewardLaw(self.config, world.law.q), clock
         self.controller, self._make_controller, self._planner = planner, make_controller, planner
         self._q_controller: QController | None = None
-        """The policy, where each move is told with what it is worth (`replay.priority_exponent`)."""
+        """The policy, if records carry Q of each move (`replay.priority_exponent` > 0)."""
         self.phase = Phase.IDLE
         self.episode = self.t = self.cell = self.previous = self.sequence = self.version = 0
         self.policy = self.wanted = 0
         self.explored = self.steps = 0
         self.pending: Record | None = None
         self.unacknowledged: list[Record] = []
-        """Records that the TMC has not acknowledged as journalled for good."""
+        """Records that the TMC has not acknowledged as durably journalled."""
 
     # Messages in.
 
-    def begin(self, begin: Begin) -> PolicyRequest | None:
-        """Start an episode, or, in a new process, take a flight up again where the TMC's last record of it ends."""
+    def on_begin(self, begin: Begin) -> PolicyRequest | None:
+        """Start an episode or, in a new process, resume a flight where the TMC's last record of it ends.
+
+        Returns the request for the policy that is still missing. A repeated message is dropped.
+        """
         if begin.episode <= self.episode:
-            return None  # a repeat
+            return None
         track = begin.track.tolist()
         self.episode, self.t, self.cell, self.previous = begin.episode, begin.tick, track[-1], track[-2:][0]
         self.sequence, self.version = begin.sequence, begin.version
         self.unacknowledged = [r for r in self.unacknowledged if r.sequence < begin.sequence]
-        self.airspace.begin(self.episode, self.world.starts(self.episode))
+        self.airspace.start_episode(self.episode, self.world.starts(self.episode))
         for uav in begin.lost.tolist():
-            self.airspace.lose(uav)
+            self.airspace.drop_peer(uav)
         self._epsilon = self.config.epsilon(self.episode)
         self._draws: list[list[float]] = self.world.explorations(self.episode, self.uav).tolist()
         self._factor = self.world.initial_factor(self.episode)
@@ -113,12 +120,12 @@ class Pilot:
         self.pending, self._answered = None, False
         if begin.shipped < 0:
             self.builder.cells.append(self.cell)
-        for tick, cell in enumerate(track):  # a process that was started again says again where it was
+        for tick, cell in enumerate(track):  # a restarted process publishes its earlier positions again
             self.airspace.tracks.publish(tick, cell)
-        return self._want(begin.policy, Phase.SENSE)
+        return self._request_policy(begin.policy, Phase.SENSE)
 
     def on_map(self, answer: Map) -> PolicyRequest | None:
-        """The TMC's answer to the record of tick t; anything else is old news and dropped."""
+        """Merge the TMC's answer to the record of tick t; drop any other answer. Returns the request for a policy."""
         self.acknowledge(answer.acknowledged)
         if (answer.episode, answer.tick) != (self.episode, self.t) or self.t > self.shipped or self._answered:
             return None
@@ -128,26 +135,27 @@ class Pilot:
         else:
             self.last_visit = merge(self.last_visit, answer.last_visit)
         self.version, self.pending, self._answered = answer.version, None, True
-        # A flight taken up again is answered before it has sensed its peers anew.
-        return self._want(answer.policy, Phase.ACT if self.phase is Phase.MAP else Phase.SENSE)
+        # A resumed flight is answered before it has sensed its peers again.
+        return self._request_policy(answer.policy, Phase.ACT if self.phase is Phase.MAP else Phase.SENSE)
 
     def acknowledge(self, sequence: int) -> list[Record]:
-        """The TMC has the records below `sequence` for good; returns those of them that were still in the
-        unacknowledged.
-        """
+        """Note that the TMC has durably journalled the records below `sequence`; return those newly acknowledged."""
         done = [r for r in self.unacknowledged if r.sequence < sequence]
         self.unacknowledged = self.unacknowledged[len(done) :]
         return done
 
     def records_from(self, sequence: int) -> list[Record]:
-        """What to send again to a TMC whose next record of this UAV is `sequence`. Raises LostRecordsError."""
+        """Return the records to resend to a TMC that expects record `sequence` next. Raises LostRecordsError."""
         again = [r for r in self.unacknowledged if r.sequence >= sequence]
         if len(again) < self.sequence - sequence:
             raise LostRecordsError(f"the TMC asks for record {sequence}, which it had acknowledged")
         return again
 
-    def _want(self, version: int, then: Phase) -> PolicyRequest | None:
-        """A policy reaches a UAV only at an exchange: ask for the one that the TMC names, if it is another."""
+    def _request_policy(self, version: int, then: Phase) -> PolicyRequest | None:
+        """Return the request for policy `version`, unless it is here. A policy reaches a UAV only at an exchange.
+
+        `then`: the phase that follows once the policy is here.
+        """
         self.phase = then
         if self._planner is not None or version == self.policy:
             return None
@@ -155,12 +163,12 @@ class Pilot:
         return PolicyRequest(version)
 
     def on_lost(self, lost: Lost) -> None:
-        """The team goes on without a UAV."""
+        """Fly on without a UAV that is lost for the rest of the episode."""
         if lost.episode == self.episode:
-            self.airspace.lose(lost.uav)
+            self.airspace.drop_peer(lost.uav)
 
     def on_policy(self, policy: Policy) -> None:
-        """The policy that was asked for. Raises PolicyError when it cannot fly here."""
+        """Take over the policy that was requested. Raises PolicyError when it cannot fly here."""
         if self.phase is Phase.POLICY and policy.version >= self.wanted:
             try:
                 self.controller = self._make_controller(policy.model)
@@ -174,9 +182,9 @@ class Pilot:
     # Flying.
 
     def advance(self) -> Record | None:
-        """Fly until a record must go out (returned), or a message is needed (None); raises Waiting for a peer.
+        """Fly until a record must go out (returned) or a message is needed (None). Raises Waiting for a peer.
 
-        Also returns after some ticks without either, so that whoever calls can listen and be heard (`under_way`).
+        Also returns None after MAX_TICKS_PER_ADVANCE, so that the caller can receive and send (`under_way`).
         """
         until = self.t + MAX_TICKS_PER_ADVANCE
         while self.t < until:
@@ -193,7 +201,7 @@ class Pilot:
 
     @property
     def under_way(self) -> bool:
-        """True while nothing is needed to go on but another call of `advance`."""
+        """Whether the flight continues with the next call of `advance`, without a message."""
         return self.phase in (Phase.SENSE, Phase.ACT, Phase.MOVE)
 
     def _sense(self) -> bool:
@@ -202,7 +210,7 @@ class Pilot:
         Returns whether a record must go out now.
         """
         if self.shipped == self.t == self.config.training.ticks:
-            self.phase = Phase.IDLE  # taken up at the episode's end, which its peers may have left behind
+            self.phase = Phase.IDLE  # resumed at the end of the episode; its peers may be in the next one
             return False
         self.peers = self.airspace.sense(self.t, self.cell)
         index = self.law.index_list
@@ -210,20 +218,21 @@ class Pilot:
             if index[cell] >= 0:
                 self.last_visit[index[cell]] = self.t
         due, fresh = self.config.due(self.uav, self.t), self.t > self.shipped
-        if fresh:  # a flight taken up again stands at a tick that the TMC has
+        if fresh:  # a resumed flight is at a tick that the TMC has
             self.builder.seen.extend((self.t, cell) for cell in self.peers)
         self.phase = Phase.MAP if due and not self._answered else Phase.ACT
         return due and fresh
 
     def _ship(self) -> Record:
-        leg = self.builder
-        seen = np.array(leg.seen, "<u2").reshape(-1, 2) if leg.seen else None
+        """Return the record of the moves since the last one, and keep it until it is acknowledged."""
+        flown = self.builder
+        seen = np.array(flown.seen, "<u2").reshape(-1, 2) if flown.seen else None
         self.pending = Record(
-            self.uav, self.incarnation, self.sequence, self.episode, leg.first, self.t, self.version, self.policy,
-            np.array(leg.cells, "<u2"), np.array(leg.actions, "u1"), np.array(leg.blocks, "u1"),
-            np.array(leg.rewards, "<f4"),
+            self.uav, self.incarnation, self.sequence, self.episode, flown.first, self.t, self.version, self.policy,
+            np.array(flown.cells, "<u2"), np.array(flown.actions, "u1"), np.array(flown.blocks, "u1"),
+            np.array(flown.rewards, "<f4"),
             EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
-            np.array(leg.values, "<f4") if leg.values else NONE,
+            np.array(flown.values, "<f4") if flown.values else NONE,
             self._clock(),
         )  # fmt: skip
         self.unacknowledged.append(self.pending)
@@ -233,19 +242,19 @@ class Pilot:
         return self.pending
 
     def map_of(self, t: int) -> NDArray[np.float64]:
-        """The UAV's own uncertainty map U_i(t), shape (R,)."""
+        """Return the UAV's own uncertainty map U_i(t), shape (R,)."""
         if self.config.scenario == 1:
             return self.active[self.law.cells].astype(np.float64)
         return self.law.values(self.last_visit, t, self._factor)
 
     def state(self) -> LocalState:
-        """What this UAV knows at t."""
+        """Return what this UAV knows at t."""
         allowed = self.observer.allowed(self.cell, self.peers)
         draw = self._draws[self.t][1]
         return LocalState(self.t, self.cell, self.previous, self.peers, self.map_of(self.t), allowed, draw)
 
     def _act(self) -> None:
-        """Choose a(t), epsilon-greedy; at the end of the episode there is nothing left to do."""
+        """Choose a(t), epsilon-greedy; at the end of the episode become idle. Raises FlightError."""
         if self.t == self.config.training.ticks:
             self.phase = Phase.IDLE
             return
@@ -257,7 +266,7 @@ class Pilot:
         self.phase = Phase.MOVE
 
     def _decide(self, explore: float, draw: float) -> None:
-        """Choose by the draws of the tick: the action, and what it is worth where records tell so."""
+        """Choose the action by the draws of the tick, and its Q values if records carry them."""
         state = None
         if self._planner is None and explore < self._epsilon:
             self.explored += 1
@@ -272,8 +281,9 @@ class Pilot:
             self.builder.values += self._q_controller.q_of(state or self.state(), self.action)
 
     def _move(self) -> None:
+        """Move to the target of a(t), or stay when it is blocked or held. Raises Waiting for a peer."""
         cell, block = self.world.moves[self.cell][self.action]
-        if not block and self.airspace.held(self.t, self.cell, cell):
+        if not block and self.airspace.is_held(self.t, self.cell, cell):
             cell, block = self.cell, Block.UAV
         k = self.law.index_list[cell]
         u = self._before_visit(k, cell) if k >= 0 else 0.0
@@ -288,7 +298,7 @@ class Pilot:
         self.phase = Phase.SENSE
 
     def _before_visit(self, k: int, cell: int) -> float:
-        """r^u by the UAV's own map: the uncertainty at t + 1 just before the visit resets it."""
+        """Return r^u by the UAV's own map: the uncertainty of a cell at t + 1 just before the visit resets it."""
         if self.config.scenario == 1:
             return float(self.active[cell])
         return self.law.value(k, self.last_visit.item(k), self.t + 1, self._factor)

@@ -1,4 +1,4 @@
-"""Classical planners, the baselines that a learned policy must beat. Each decides by what one UAV knows, no more."""
+"""Classical planners, the baselines that a learned policy must beat. Each decides only by what one UAV knows."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from tmc.kernel.world import World
 
 @dataclass(frozen=True)
 class LocalState:
-    """What a UAV knows when it decides: its cell and the one before, the cells of sensed peers, its map `u` (R,), the
-    moves that nothing known blocks, and one draw in [0, 1) of its own."""
+    """What a UAV knows when it decides at `tick`.
+
+    `cell`, `previous`: its cell at t and at t - 1. `peers`: cells of sensed peers. `u` (R,): its own uncertainty map.
+    `allowed`: ids of the actions that nothing known blocks. `draw`: one uniform draw in [0, 1).
+    """
 
     tick: int
     cell: int
@@ -28,17 +31,19 @@ class LocalState:
 
 
 class Controller(Protocol):
-    """A policy or a planner: chooses an action id."""
+    """A policy or a planner."""
 
-    def choose(self, state: LocalState) -> int: ...
+    def choose(self, state: LocalState) -> int:
+        """Return the id of the chosen action."""
+        ...
 
 
 @runtime_checkable
 class QController(Controller, Protocol):
-    """A policy: it also knows what actions are worth."""
+    """A policy, which also has Q values."""
 
     def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
-        """Q(o, a), and the largest Q(o, .) of an action that may be chosen."""
+        """Return Q(o, a), and the largest Q(o, .) of an action that may be chosen."""
         ...
 
 
@@ -46,17 +51,17 @@ Planner = Callable[[World, LocalState], int]
 
 
 def pick(choices: list[int], draw: float) -> int:
-    """One of the choices, each equally likely."""
+    """Return one of the choices, each equally likely, by a draw in [0, 1)."""
     return choices[int(draw * len(choices))]
 
 
 def random(_world: World, state: LocalState) -> int:
-    """Any of the nine actions, blocked or not: what exploration alone does."""
+    """Choose any of the nine actions, blocked or not, as exploration alone does."""
     return pick(list(range(N_ACTIONS)), state.draw)
 
 
 def random_road(world: World, state: LocalState) -> int:
-    """A random move along the road that does not turn back unless it must; off the road, a move nearer to it."""
+    """Choose a random move along the road that does not turn back unless it must; off the road, a move nearer to it."""
     targets = world.grid.target_lists[state.cell]
     onward = [a for a in state.allowed if a != STAY and targets[a] != state.previous]
     road = [a for a in onward if world.map.road[targets[a]]]
@@ -64,7 +69,7 @@ def random_road(world: World, state: LocalState) -> int:
 
 
 def greedy(world: World, state: LocalState) -> int:
-    """The best of the nine cells by the UAV's own map; ties go to the cell nearest to the road, then to the draw."""
+    """Choose the most uncertain of the nine cells; ties go to the cell nearest to the road, then to the draw."""
     index, targets = world.law.index_list, world.grid.target_lists[state.cell]
     u = [float(state.u[index[targets[a]]]) if index[targets[a]] >= 0 else 0.0 for a in state.allowed]
     best = max(u)
@@ -82,7 +87,7 @@ PREFIX = "planner:"
 
 
 class PlannerController:
-    """A planner in a world, as a Controller."""
+    """Makes a Controller of a planner in a world. `name`: with or without PREFIX."""
 
     def __init__(self, world: World, name: str) -> None:
         self._world, self._planner = world, PLANNERS[name.removeprefix(PREFIX)]

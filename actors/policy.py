@@ -1,11 +1,11 @@
-"""The policy that flies is a file: an ONNX model run by ONNX Runtime on one thread. No torch in the process."""
+"""Flies a policy file: an ONNX model, run by ONNX Runtime on one thread. There is no torch in the process."""
 
 from __future__ import annotations
 
 import os
 from typing import Any
 
-# Without it, importing ONNX Runtime starts a thread that reports its use, and a UAV is forked from a process with none.
+# Otherwise importing ONNX Runtime starts a telemetry thread, and a UAV is forked from a process without threads.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 import numpy as np
@@ -20,16 +20,16 @@ from tmc.kernel.policy import INPUT, KEY, OUTPUT, FlightError, PolicyCard, Polic
 
 
 def open_model(model: bytes) -> tuple[Any, PolicyCard]:
-    """The session and the description of a policy file; raises PolicyError for a file that cannot be one."""
+    """Open a policy file; return its ONNX Runtime session and its card. Raises PolicyError."""
     check_kind(model)
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.log_severity_level = 4  # a broken file is reported by us, in one sentence
+    options.log_severity_level = 4  # Overfly reports a broken file itself, in one sentence
     try:
         session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # ONNX Runtime raises its own kinds, which it does not export
+    except Exception as error:  # ONNX Runtime does not export the classes that it raises
         raise PolicyError(f"ONNX Runtime {ort.__version__} cannot use the model ({reason(error)})") from None
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:
@@ -40,12 +40,26 @@ def open_model(model: bytes) -> tuple[Any, PolicyCard]:
 
 
 def read_card(model: bytes) -> PolicyCard:
-    """The description in a policy file."""
+    """Return the card of a policy file. Raises PolicyError."""
     return open_model(model)[1]
 
 
+def run_model(session: Any, observations: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Q of B observations, (B, 3, height, width) float32 -> (B, 9). Raises PolicyError when the model cannot be run."""
+    try:
+        q: np.ndarray[Any, np.dtype[np.float32]] = session.run([OUTPUT], {INPUT: np.ascontiguousarray(observations)})[0]
+    except Exception as error:  # ONNX Runtime raises its own kinds
+        raise PolicyError(f"the model could not be run ({reason(error)})") from None
+    if q.shape != (len(observations), N_ACTIONS):
+        raise PolicyError(f"the model gives values of shape {list(q.shape)}: it must be [{len(observations)}, 9]")
+    return q
+
+
 class PolicyController:
-    """argmax_a Q(o, a; theta), over the allowed actions when the policy was trained to mask blocked moves."""
+    """Chooses argmax_a Q(o, a; theta), over the allowed actions when the policy was trained to mask blocked moves.
+
+    Raises PolicyError for a model that does not fit the mission or cannot be run.
+    """
 
     def __init__(self, model: bytes, config: Config, observer: ObservationBuilder) -> None:
         self._session, card = open_model(model)
@@ -53,13 +67,13 @@ class PolicyController:
         self._mask, self._canvas = config.exploration.mask_blocked, observer.canvas()
         self._q = np.zeros((1, N_ACTIONS), np.float32)
         self._values: list[float] = []
-        """Q of the nine actions in `_seen`."""
-        self._seen: LocalState | None = None
-        self._bound = self._bind()
+        """Q(o, .) of the nine actions in `_last_state`."""
+        self._last_state: LocalState | None = None
+        self._binding = self._bind()
         self._check(observer)
 
     def _bind(self) -> Any:
-        """Tell ONNX Runtime once where image and values are: a call takes a fifth less time than one that is told."""
+        """Bind the memory of image and values once: it makes a call a fifth faster than passing arrays each time."""
         bound = self._session.io_binding()
         image, q = self._canvas.image, self._q
         bound.bind_input(INPUT, "cpu", 0, np.float32, image.shape, image.ctypes.data)
@@ -67,7 +81,10 @@ class PolicyController:
         return bound
 
     def _check(self, observer: ObservationBuilder) -> None:
-        """Refuse a model that cannot be run, or not again with the same values. What these are shows in flight only."""
+        """Raise PolicyError for a model that cannot be run, or gives other values for the same observation.
+
+        Values that are not finite are found in flight only.
+        """
         self._canvas.draw(observer.first_cell, [], np.zeros(observer.R))
         try:
             given = self._session.run([OUTPUT], {INPUT: self._canvas.image})[0]
@@ -81,36 +98,37 @@ class PolicyController:
             raise PolicyError("the model gives other values when it sees the same again: it must not draw at random")
 
     def _run(self) -> None:
-        self._session.run_with_iobinding(self._bound)
+        self._session.run_with_iobinding(self._binding)
 
     def q_values(self) -> np.ndarray[Any, np.dtype[np.float32]]:
-        """Q of the nine actions for the observation on the canvas; the next call writes over them."""
+        """Return Q (9,) float32 for the observation on the canvas; the next call overwrites it."""
         self._run()
         q: np.ndarray[Any, np.dtype[np.float32]] = self._q[0]
         return q
 
     def choose(self, state: LocalState) -> int:
-        q = self._look(state)
+        """Return the action with the largest Q. Raises FlightError."""
+        q = self._q_of_state(state)
         if self._mask:
             return max(state.allowed, key=q.__getitem__)
         return q.index(max(q))
 
     def q_of(self, state: LocalState, action: int) -> tuple[float, float]:
-        """Q(o, a), and the largest Q(o, .) among the actions that `choose` chooses from."""
-        q = self._look(state)
+        """Return Q(o, a), and the largest Q(o, .) of the actions that `choose` chooses from. Raises FlightError."""
+        q = self._q_of_state(state)
         return q[action], max(q[a] for a in state.allowed) if self._mask else max(q)
 
-    def _look(self, state: LocalState) -> list[float]:
-        """Q of what is in state; who asks again about the last one gets what was computed. Raises FlightError."""
-        if state is not self._seen:
+    def _q_of_state(self, state: LocalState) -> list[float]:
+        """Return Q(o, .) of the nine actions, computed once for repeated calls with one state. Raises FlightError."""
+        if state is not self._last_state:
             self._canvas.draw(state.cell, state.peers, state.u)
             try:
                 values: list[float] = self.q_values().tolist()
-            except Exception as error:  # as above: what a model does may depend on what it sees
+            except Exception as error:  # as above: whether a model runs may depend on its input
                 raise FlightError(f"could not be run ({reason(error)})") from None
             total = sum(values)
-            if total - total != 0.0:  # a value that is not finite makes the sum of them so, and no other can
+            if total - total != 0.0:  # the sum is finite exactly if all values are
                 shown = ", ".join(f"{value:.3g}" for value in values)
                 raise FlightError(f"gave values that are not finite ({shown})")
-            self._values, self._seen = values, state
+            self._values, self._last_state = values, state
         return self._values

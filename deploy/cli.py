@@ -45,7 +45,7 @@ COMMANDS: tuple[Command, ...] = (
 
 
 def mistakes() -> tuple[type[Exception], ...]:
-    """The errors that are the user's to mend: one sentence and exit code 2."""
+    """The errors that are the user's to fix: one sentence and exit code 2."""
     from tmc.kernel.config import ConfigError  # noqa: PLC0415  the command starts without NumPy
     from tmc.kernel.policy import PolicyError  # noqa: PLC0415
     from tmc.kernel.roadmap import MapError  # noqa: PLC0415
@@ -89,14 +89,18 @@ def discard_output() -> None:
 
 
 def check_install() -> None:
-    """The four packages have plain names: make sure that they are ours, side by side in one folder."""
-    origins = [(importlib.util.find_spec(name), name) for name in ("actors", "learner", "tmc", "deploy")]
-    roots = {str(Path(spec.origin).resolve().parent.parent) if spec and spec.origin else f"no {name}"
-             for spec, name in origins}  # fmt: skip
+    """Raise ConfigError unless `overfly.py` and the four packages, whose names are plain, lie side by side."""
+    roots = {_folder_of("overfly", 1), *(_folder_of(name, 2) for name in ("actors", "learner", "tmc", "deploy"))}
     if len(roots) > 1:
         from tmc.kernel.config import ConfigError  # noqa: PLC0415
 
         raise ConfigError(f"the packages of Overfly lie in different folders ({', '.join(sorted(roots))}): reinstall")
+
+
+def _folder_of(name: str, depth: int) -> str:
+    """The folder that a module or a package lies in, `depth` steps above its file."""
+    spec = importlib.util.find_spec(name)
+    return str(Path(spec.origin).resolve().parents[depth - 1]) if spec and spec.origin else f"no {name}"
 
 
 def main(argv: list[str] | None = None, trial: Mapping[str, Any] | None = None) -> int:

@@ -1,6 +1,6 @@
-"""What Overfly needs of other makers: is it installed, is it new enough, and the line that installs it.
+"""Checks the packages that Overfly needs: installed, new enough, importable; and gives the line that installs them.
 
-The packages, their extras and their least versions are those of pyproject.toml, by way of the installed metadata.
+The packages, their extras and their least versions are those of pyproject.toml, by the installed metadata.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 CORE, LEARNER, FIGURES = "", "learner", "figures"
-"""What everybody needs, and the extras that a command may need."""
+"""The packages that every command needs, and the extras that a command may need."""
 USERS = {CORE: "Overfly", LEARNER: "a learner", FIGURES: "a picture"}
 PURPOSES = {
     "numpy": "arithmetic of the world",
@@ -37,15 +37,15 @@ PURPOSES = {
 }
 """What each package is for, in the order in which `doctor` lists them."""
 MODULES = {"pyzmq": "zmq", "protobuf": "google.protobuf", "foxglove-schemas-protobuf": "foxglove_schemas_protobuf"}
-"""What is imported, where that is not the package's own name."""
+"""The module to import, where its name is not the package's."""
 MISSING = "not installed"
-OURS = {"actors", "deploy", "learner", "tmc", "__main__"}
+OURS = {"actors", "deploy", "learner", "overfly", "tmc", "__main__"}
 _REQUIREMENT = re.compile(r"([\w.-]+?) *>= *([\d.]+) *(?:; *extra *== *['\"]([\w-]+)['\"])?")
 
 
 @dataclass(frozen=True)
 class Package:
-    """A package that is needed by all or, with its extra, by some; `least` is the oldest version that will do."""
+    """A package that every command needs or, with an `extra`, some. `least`: the oldest version that works."""
 
     name: str
     least: str
@@ -53,16 +53,16 @@ class Package:
 
     @property
     def module(self) -> str:
-        """What is imported of it."""
+        """The module to import."""
         return MODULES.get(self.name, self.name)
 
     def problem(self) -> str:
-        """What is wrong with how it is installed, a phrase; nothing when it is there and new enough."""
+        """Return what is wrong with its installation, a phrase; "" if it is installed and new enough."""
         if not _is_there(self.module):
             return MISSING
         try:
             found = version(self.name)
-        except PackageNotFoundError:  # there, and put there by other means: what it is shows when it is used
+        except PackageNotFoundError:  # installed by other means, with an unknown version
             return ""
         return f"{found} is older than {self.least}" if found and _release(found) < _release(self.least) else ""
 
@@ -70,12 +70,12 @@ class Package:
 def _is_there(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):  # a part of its name is missing, or was taken out of sys.modules
+    except (ImportError, ValueError):  # a part of its name is missing, or was removed from sys.modules
         return False
 
 
 def _release(text: str) -> list[int]:
-    """The numbers of a version, to be compared: 2.13.0+cpu is [2, 13]."""
+    """Return the numbers of a version, for comparison: 2.13.0+cpu is [2, 13]."""
     numbers = [int(part) for part in re.findall(r"\d+", (re.match(r"[\d.]+", text) or [""])[0])]
     while numbers and not numbers[-1]:
         del numbers[-1]
@@ -84,7 +84,7 @@ def _release(text: str) -> list[int]:
 
 @cache
 def packages() -> tuple[Package, ...]:
-    """Every package that is needed, those of all first; none where Overfly itself is not installed."""
+    """Return every needed package, in the order of PURPOSES; none if Overfly itself is not installed."""
     found, lines = {}, list[str]()
     with suppress(PackageNotFoundError):
         lines = requires("overfly") or lines
@@ -96,15 +96,15 @@ def packages() -> tuple[Package, ...]:
 
 
 def lacking(extra: str) -> str:
-    """Which packages of an extra are missing or too old, and what to do; nothing when all are there."""
+    """Return a sentence on missing or old packages of an extra, with the fix; "" if all are installed."""
     wrong = {p.name: p.problem() for p in packages() if p.extra == extra}
     listed = _enumerated([f"{name} ({problem})" for name, problem in wrong.items() if problem])
     return f"{USERS[extra]} needs {listed}: run {install(extra)}" if listed else ""
 
 
 def require(*extras: str) -> None:
-    """Raise ConfigError unless all that everybody needs is there, and these extras."""
-    from tmc.kernel.config import ConfigError  # noqa: PLC0415  this module is imported where nothing is installed
+    """Raise ConfigError unless the packages of every command and of these extras are installed."""
+    from tmc.kernel.config import ConfigError  # noqa: PLC0415  this module must import without any package
 
     if not packages():
         root = Path(__file__).resolve().parent.parent
@@ -119,7 +119,7 @@ def _enumerated(items: list[str]) -> str:
 
 
 def install(extra: str) -> str:
-    """The line that installs what an extra needs: from where this Overfly came, or else the packages alone."""
+    """Return the line that installs an extra: from where this Overfly was installed, or else only the packages."""
     wanted = f"[{extra}]" if extra else ""
     url, editable = _origin(distribution("overfly"))
     path = unquote(urlsplit(url).path)
@@ -135,16 +135,16 @@ def _pip() -> str:
 
 
 def _origin(overfly: Distribution) -> tuple[str, bool]:
-    """(where it was installed from, whether that folder itself is used); empty where pip did not note it."""
+    """Return (URL that it was installed from, whether it is editable); ("", False) if pip did not note it."""
     try:
-        told = json.loads(overfly.read_text("direct_url.json") or "{}")
-        return str(told.get("url", "")), bool(told.get("dir_info", {}).get("editable"))
+        origin = json.loads(overfly.read_text("direct_url.json") or "{}")
+        return str(origin.get("url", "")), bool(origin.get("dir_info", {}).get("editable"))
     except (ValueError, AttributeError):
         return "", False
 
 
 def broken(error: BaseException) -> str:
-    """What is to be said of an error that comes of a package that cannot be imported; nothing of any other error."""
+    """Return a sentence on an error of a package that cannot be imported, with the fix; "" for any other error."""
     known = {package.module.partition(".")[0]: package for package in packages()}
     missing = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
     package = known.get(missing.partition(".")[0]) or known.get(_imported(error, known))
@@ -159,7 +159,7 @@ def broken(error: BaseException) -> str:
 
 
 def _imported(error: BaseException, known: Container[str]) -> str:
-    """The innermost of the known packages that was being imported when the error came up; empty if none was."""
+    """Return the innermost of the known packages that was being imported at the error; "" if none was."""
     trace, found = error.__traceback__, ""
     while trace is not None:
         name, code = str(trace.tb_frame.f_globals.get("__name__", "")).partition(".")[0], trace.tb_frame.f_code.co_name

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from actors.planners import PLANNERS, PREFIX
 from tmc.analysis.run_config import settings_of
-from tmc.center.journal import journal_in
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.files import plain
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import PolicyCard, PolicyError
-from tmc.kernel.roadmap import COPY, builtin_maps
+from tmc.kernel.roadmap import builtin_maps
 from tmc.kernel.text import nearest, suggestion
 from tmc.kernel.world import World
+from tmc.record.run_folder import RunFolder
 from tmc.wire import process
 from tmc.wire.capacity import check_policy
 
@@ -35,8 +35,11 @@ class PolicySpec:
     values: dict[str, Any]
 
 
-def resolve(name: str) -> PolicySpec:
-    """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy."""
+def resolve(name: str, say: Callable[[str], None] = process.tell) -> PolicySpec:
+    """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy.
+
+    `say` takes a sentence on each setting of a run folder that was edited since.
+    """
     if name.startswith(PREFIX):
         if name.removeprefix(PREFIX) not in PLANNERS:
             raise ConfigError(f"there is no planner '{plain(name, 60)}': {suggestion(name, KNOWN)}")
@@ -48,23 +51,23 @@ def resolve(name: str) -> PolicySpec:
         fix = f"did you mean {near}?" if near else f"write one of these, or {', '.join(KNOWN)}"
         raise ConfigError(f"'{plain(name)}' is not a policy file, a run folder or a planner: {fix}") from None
     if is_folder:
-        return _of_run(Path(name))
+        return _of_run(Path(name), say)
     return _of_file(name, Path(name), {})
 
 
-def _of_run(folder: Path) -> PolicySpec:
+def _of_run(folder: Path, say: Callable[[str], None]) -> PolicySpec:
     """The final policy of a run, in the mission that it was trained for."""
-    journal, policy = journal_in(folder), folder / "policies" / "final.onnx"
-    if journal is None and not (folder / "config.json").exists():
+    journal, policy = RunFolder(folder).existing_journal(), RunFolder(folder).final_policy
+    if journal is None and not RunFolder(folder).config.exists():
         raise ConfigError(f"{folder} is no run folder: it has no config.json")
     settings = settings_of(folder, journal)
     for note in settings.notes:
-        process.tell(f"{folder}: {note}")
+        say(f"{folder}: {note}")
     values = dict(flat(settings.config)) | _map_of(folder, settings.config)
     if values["team.controller"] != "policy":
         return PolicySpec(str(folder), None, values)
     if not policy.exists():
-        policy = folder / "policies" / "flown.onnx"
+        policy = RunFolder(folder).fixed_policy
     if not policy.exists():
         raise ConfigError(f"{folder} has no final policy: its training did not end")
     return _of_file(str(folder), policy, values)
@@ -72,7 +75,7 @@ def _of_run(folder: Path) -> PolicySpec:
 
 def _map_of(folder: Path, config: Config) -> dict[str, Any]:
     """The map of a run that flew over a user's map: the copy in its folder, where there is one."""
-    copy = folder / COPY
+    copy = RunFolder(folder).map_copy
     return {"world.map": str(copy)} if config.world.map not in builtin_maps() and copy.exists() else {}
 
 

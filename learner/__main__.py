@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads must not spin where UAVs want the core
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle threads must not spin on cores that UAVs need
 
 from learner.batching import TrainingError
 from learner.checkpoint import CheckpointError
@@ -23,7 +23,7 @@ MISTAKES = (CheckpointError, ConfigError, MapError, RecordError, EndpointError, 
 
 
 def learn(endpoint: str, out: Path) -> int:
-    """Learn until the TMC ends the mission; returns the exit code. Raises MISTAKES."""
+    """Learn until the TMC ends the mission; return the exit code. Raises MISTAKES."""
     stop = process.Stop()
     service = Service(endpoint, out)
     try:
@@ -36,11 +36,11 @@ def learn(endpoint: str, out: Path) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Parse the options of a child process and learn."""
+    """Parse the options of a child process, learn, and return the exit code."""
     parser = Options("learner", description=__doc__)
     parser.add_argument("--connect", required=True, help="the TMC's endpoint for UAVs; the learner's lies beside it")
     parser.add_argument("--out", type=Path, required=True, help="run folder")
-    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
     a = parser.parse_args(argv)
     process.become_child(a.parent)
     return process.run_child(lambda: learn(a.connect, a.out), MISTAKES)

@@ -1,6 +1,6 @@
-"""Adam, as torch's fused kernel has it, without torch.optim.Adam around it.
+"""Adam by torch's fused kernel, without the class torch.optim.Adam.
 
-That class imports the compiler of torch (torch._dynamo) once it is made: 800 modules, 70 MB, 1 to 3 s of each start.
+The class imports torch's compiler (torch._dynamo) when it is made: 800 modules, 70 MB, 1 to 3 s of each start.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ BETAS, EPS = (0.9, 0.999), 1e-8
 
 
 class Adam:
-    """Adam over `params` with learning rate `lr`. `state`: of each weight its `step`, `exp_avg` and `exp_avg_sq`."""
+    """Updates `params` with learning rate `lr`. `state`: by weight, its `step`, `exp_avg` and `exp_avg_sq`."""
 
     def __init__(self, params: Iterable[nn.Parameter], lr: float) -> None:
         self.params, self.lr = [*params], lr
@@ -24,14 +24,14 @@ class Adam:
         self.state = {p: {"step": torch.zeros(()), **{m: torch.zeros_like(p) for m in moments}} for p in self.params}
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Clear the gradients."""
         for p in self.params:
             p.grad = None
 
     @torch.no_grad()
     def step(self) -> None:
-        """One step along the gradients; a weight without one stays as it is."""
-        moved = [(p, laid_like(p, p.grad), self.state[p]) for p in self.params if p.grad is not None]
+        """Update all weights by their gradients; a weight without a gradient stays as it is."""
+        moved = [(p, with_layout_of(p, p.grad), self.state[p]) for p in self.params if p.grad is not None]
         params, grads, states = ([*column] for column in zip(*moved, strict=True))
         first, second, steps = ([s[key] for s in states] for key in ("exp_avg", "exp_avg_sq", "step"))
         adam(
@@ -40,10 +40,10 @@ class Adam:
         )  # fmt: skip
 
 
-def laid_like(p: Tensor, gradient: Tensor) -> Tensor:
-    """The same gradient, lying in memory as its weight does.
+def with_layout_of(p: Tensor, gradient: Tensor) -> Tensor:
+    """Return the gradient with the memory layout of its weight.
 
-    torch's kernel goes through both as they lie. Filters have their channels last: with a gradient that has them first,
-    each weight would take the step of another one, and nothing would say so.
+    torch's kernel walks through the memory of both. Filters have their channels last; with a channels-first gradient,
+    each weight would silently take the step of another one.
     """
     return gradient if gradient.stride() == p.stride() else torch.empty_like(p).copy_(gradient)

@@ -1,4 +1,4 @@
-"""What the learner takes in: a minibatch off the wire, checked, its observations drawn."""
+"""Turns a minibatch message into a batch: checks it, and draws its observations."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tmc.wire.messages import Minibatch
 
 
 class TrainingError(ValueError):
-    """An update that cannot be made: one sentence with the mend. It leaves theta and Adam as they were."""
+    """An update that cannot be made: one sentence with the fix. It leaves theta and Adam as they were."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """A minibatch with images. `observation`: (b, C, H, W); `next_observation(rows)`: those of o_{t+n} asked for.
+    """A minibatch with images. `observation`: o_t (b, C, H, W). `next_observation(rows)`: o_{t+n} of these rows.
 
-    Both may lie in memory that the next batch is drawn over. The other fields are those of `Minibatch`.
+    Both may lie in memory that the next batch overwrites. The other fields are those of `Minibatch`.
     """
 
     episodes: int
@@ -39,7 +39,7 @@ class Batch:
 
 
 class BatchBuilder:
-    """Draws the observations of minibatches, into the same memory each time and as the convolutions like them."""
+    """Draws the observations of minibatches into the same memory each time, channels last for the convolutions."""
 
     def __init__(self, observer: ObservationBuilder) -> None:
         self.observer = observer
@@ -48,7 +48,7 @@ class BatchBuilder:
         self._now = self._next = np.empty((0, *observer.shape), np.float32)
 
     def build(self, minibatch: Minibatch) -> Batch:
-        """The batch; the one before must not be used any more. Raises TrainingError for what cannot be drawn."""
+        """Return the batch; the previous one must not be used any more. Raises TrainingError if it cannot be drawn."""
         views, b = self._views(minibatch), len(minibatch.action)
         if len(self._now) != b:
             self._now, self._next = self._memory(b), self._memory(b)
@@ -61,10 +61,11 @@ class BatchBuilder:
         return Batch(m.episodes, now, following, m.action, m.reward, m.discount, m.allowed, m.index, m.weight)
 
     def _memory(self, b: int) -> Floats:
-        """Shape (b, C, H, W), in memory (b, H, W, C)."""
+        """Return an array of shape (b, C, H, W) whose memory is (b, H, W, C)."""
         return np.empty((b, *self._sides, self._channels), np.float32).transpose(0, 3, 1, 2)
 
     def _views(self, minibatch: Minibatch) -> Views:
+        """Return what the 2 b observations show. Raises TrainingError for shapes or cells that do not fit."""
         m, b, K = minibatch, len(minibatch.action), self.observer.grid.size
         if not b or m.cells.shape != (2 * b,) or m.peers.shape[0] != 2 * b or m.u.shape != (2 * b, self.observer.R):
             raise TrainingError(
@@ -77,7 +78,7 @@ class BatchBuilder:
 
 
 def as_channels_last(images: Floats) -> Tensor:
-    """(B, C, H, W) float32, channels last; the same memory where it lies so already."""
+    """Return (B, C, H, W) float32, channels last; in the same memory if that is its layout already."""
     return torch.from_numpy(images).contiguous(memory_format=torch.channels_last)
 
 

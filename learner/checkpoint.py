@@ -1,7 +1,7 @@
-"""Checkpoints: all state of a trainer in one safetensors file, which is there whole or not at all.
+"""Checkpoints: all state of a trainer in one safetensors file, written whole or not at all.
 
-A file is written under another name, synced, and then renamed; its own metadata hold the counters, the settings and a
-digest of everything. Nothing in it is ever executed, as unpickling would.
+A file is written under another name, synced, and then renamed. Its metadata hold the counters, the settings and a
+digest of everything. Nothing in it is ever executed, unlike in a pickle.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +21,15 @@ from torch import Tensor
 from learner.trainer import State, Trainer, layout
 from tmc.kernel import files
 from tmc.kernel.config import flat
+from tmc.record.disk import NEW_SUFFIX, write_atomically
 
 FORMAT = 1
+"""Version of the file's contents."""
 KEEP = 3
+"""Checkpoints that are kept."""
 KEY, DIGEST = "overfly", "digest"
 """Entries of the file's metadata: all of `Meta` as JSON, and the SHA-256 of that and of the tensors."""
-PREFIX, SUFFIX, PART = "checkpoint-", ".safetensors", ".part"
+PREFIX, SUFFIX = "checkpoint-", ".safetensors"
 NETWORK = (
     "network.channels",
     "network.kernel",
@@ -36,18 +38,18 @@ NETWORK = (
     "observation.view",
     "observation.near",
 )
-"""Settings in which a checkpoint and a mission must agree; the shape of the view is compared as well."""
+"""Settings that must be equal in a checkpoint and a mission; the shape of the observation is compared too."""
 
 log = logging.getLogger(__name__)
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is damaged or was made for something else: one sentence with the mend."""
+    """A checkpoint that is damaged or does not fit the mission: one sentence with the fix."""
 
 
 @dataclass(frozen=True)
 class Meta:
-    """What a checkpoint says of itself. `shape`: of an observation; `config`: all settings, by dotted key."""
+    """The metadata of a checkpoint. `shape`: of an observation. `config`: all settings, by dotted key."""
 
     format: int
     updates: int
@@ -59,7 +61,7 @@ class Meta:
 
 @dataclass(frozen=True)
 class Saved:
-    """A checkpoint that was read: the name of its file, what it says of itself, and what it holds."""
+    """A checkpoint that was read: the name of its file, its metadata, and the trainer's state."""
 
     name: str
     meta: Meta
@@ -67,82 +69,67 @@ class Saved:
 
 
 def save(folder: Path, trainer: Trainer) -> Path:
-    """Write `checkpoint-<updates>.safetensors` in one step; keep it and the two before it. Raises OSError."""
+    """Write `checkpoint-<updates>.safetensors`, delete all but the newest KEEP; return its path. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     state = trainer.state()
     meta = Meta(FORMAT, state.updates, state.version, state.copied, list(trainer.shape), flat(trainer.config))
     text = json.dumps(vars(meta), sort_keys=True)
     path = folder / f"{PREFIX}{state.updates}{SUFFIX}"
-    _write(path, to_safetensors(state.tensors, {KEY: text, DIGEST: digest(text, state.tensors)}))
+    write_atomically(path, to_safetensors(state.tensors, {KEY: text, DIGEST: digest(text, state.tensors)}), sync=True)
     _prune(folder, state.updates)
     return path
 
 
-def _write(path: Path, data: bytes) -> None:
-    """The file is there with all its bytes, or as it was before, whenever the power goes."""
-    part = path.with_name(path.name + PART)
-    with part.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)  # the new name itself is on the disk only then
-    finally:
-        os.close(directory)
-
-
 def _prune(folder: Path, updates: int) -> None:
-    """Drop what a killed writer left, and all but the newest KEEP up to `updates`.
+    """Delete the partial files of killed writers, and all but the newest KEEP checkpoints up to `updates`.
 
-    Files of later updates are damaged, or of a line that the user has left: they are not ours to delete.
+    Checkpoints of later updates are damaged, or belong to a training that the user went back from, so they stay.
     """
     old = [path for n, path in _numbered(folder) if n <= updates][KEEP:]
-    for path in [*old, *folder.glob(f"{PREFIX}*{SUFFIX}{PART}")]:
+    for path in [*old, *folder.glob(f"{PREFIX}*{SUFFIX}{NEW_SUFFIX}")]:
         path.unlink(missing_ok=True)
 
 
 def _numbered(folder: Path) -> list[tuple[int, Path]]:
-    """(updates, path) of every checkpoint in the folder, the newest first."""
+    """Return (updates, path) of every checkpoint in the folder, the newest first."""
     names = ((path.name[len(PREFIX) : -len(SUFFIX)], path) for path in folder.glob(f"{PREFIX}*{SUFFIX}"))
     return sorted(((int(n), path) for n, path in names if n.isdecimal()), reverse=True)
 
 
-def newest(folder: Path, tell: Callable[[str], None] = log.warning) -> Saved | None:
-    """The checkpoint with the most updates that can be read, or None; `tell` is told of each damaged one."""
+def newest(folder: Path, warn: Callable[[str], None] = log.warning) -> Saved | None:
+    """Return the readable checkpoint with the most updates, or None; `warn` gets a sentence on each damaged one."""
     for _, path in _numbered(folder):
         try:
             return read(path)
         except CheckpointError as error:
-            tell(f"skipped: {error}")
+            warn(f"skipped: {error}")
     return None
 
 
 def read(path: Path) -> Saved:
-    """What a checkpoint holds. Raises CheckpointError for one that is damaged or of a foreign format."""
-    damaged = f"the checkpoint {path.name} is damaged or cut short: delete it to go on from an older one"
+    """Read a checkpoint. Raises CheckpointError if it is missing, damaged or of another format."""
+    damaged = f"the checkpoint {path.name} is damaged or cut short: delete it to resume from an older one"
     try:
         files.check(path)
         with safe_open(path, framework="pt") as file:
-            notes = file.metadata() or {}
+            metadata = file.metadata() or {}
             tensors: dict[str, Tensor] = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        text = notes[KEY]
-        known = json.loads(text)["format"]
+        text = metadata[KEY]
+        version = json.loads(text)["format"]
     except FileNotFoundError:
         raise CheckpointError(f"there is no checkpoint {path}: choose one that is in its folder") from None
     except (SafetensorError, OSError, KeyError, TypeError, ValueError):
         raise CheckpointError(damaged) from None
-    if known != FORMAT:
-        raise CheckpointError(f"the checkpoint {path.name} has format {known}, this Overfly reads format {FORMAT}")
-    if notes.get(DIGEST) != digest(text, tensors):
+    if version != FORMAT:
+        raise CheckpointError(f"the checkpoint {path.name} has format {version}, this Overfly reads format {FORMAT}")
+    if metadata.get(DIGEST) != digest(text, tensors):
         raise CheckpointError(damaged)
     meta = Meta(**json.loads(text))
     return Saved(path.name, meta, State(tensors, meta.updates, meta.version, meta.copied))
 
 
 def load(saved: Saved, trainer: Trainer) -> None:
-    """Make the trainer go on from a checkpoint. Raises CheckpointError, and leaves the trainer as it was."""
+    """Load a checkpoint into the trainer. Raises CheckpointError, and leaves the trainer as it was."""
     difference = _difference(saved.meta, trainer)
     if difference:
         raise CheckpointError(f"the checkpoint {saved.name} {difference}: choose the settings it was made with")
@@ -152,7 +139,7 @@ def load(saved: Saved, trainer: Trainer) -> None:
 
 
 def _difference(meta: Meta, trainer: Trainer) -> str:
-    """In what the checkpoint's network differs from the trainer's, "" when in nothing."""
+    """Return how the checkpoint's network differs from the trainer's, as part of a sentence; "" if it does not."""
     if tuple(meta.shape) != trainer.shape:
         return f"was made for observations of shape {tuple(meta.shape)}, this mission has {trainer.shape}"
     mine = flat(trainer.config)
@@ -164,7 +151,7 @@ def _difference(meta: Meta, trainer: Trainer) -> str:
 
 
 def digest(text: str, tensors: dict[str, Tensor]) -> str:
-    """SHA-256 over the metadata and all tensors, in the order of their names: a single flipped bit shows."""
+    """Return the SHA-256 of the metadata and all tensors, in the order of their names."""
     total = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         total.update(name.encode())

@@ -1,7 +1,7 @@
-"""The policy file: the Q-network as an ONNX model that carries its own description.
+"""Exports the policy file: the Q-network as an ONNX model that carries its own card.
 
-The graph is written node by node rather than traced by torch's exporter, which would take seconds at every push; five
-operators are all that the network has.
+The graph is written node by node, because torch's exporter would take seconds per published policy. The network has
+only five operators.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ BATCH = "batch"
 
 
 def to_onnx(net: QNet, card: PolicyCard) -> bytes:
-    """The network as an ONNX file: INPUT (batch, C, H, W) float32 to OUTPUT (batch, 9) float32, the card under KEY.
+    """Return the network as an ONNX file: INPUT (batch, C, H, W) float32, OUTPUT (batch, 9) float32, card under KEY.
 
-    Same weights and same card give the same bytes.
+    The same weights and the same card give the same bytes.
     """
     graph = helper.make_graph(
         _nodes(net),
@@ -39,13 +39,13 @@ def to_onnx(net: QNet, card: PolicyCard) -> bytes:
 
 
 def _nodes(net: QNet) -> list[Any]:
-    """QNet.forward, operator by operator."""
+    """Return QNet.forward as ONNX operators."""
     nodes, x = [], INPUT
     for i in range(len(net.convs)):
-        behind = {"pads": [0, 0, *net.pad]} if i == 0 and any(net.pad) else {}
+        padding = {"pads": [0, 0, *net.pad]} if i == 0 and any(net.pad) else {}
         strides = [net.stride, net.stride]
         nodes += [
-            helper.make_node("Conv", [x, *_layer(f"convs.{i}")], [f"conv{i}"], strides=strides, **behind),
+            helper.make_node("Conv", [x, *_layer(f"convs.{i}")], [f"conv{i}"], strides=strides, **padding),
             helper.make_node("Relu", [f"conv{i}"], [f"relu{i}"]),
         ]
         x = f"relu{i}"
@@ -61,7 +61,7 @@ def _nodes(net: QNet) -> list[Any]:
 
 
 def _crop_nodes() -> list[Any]:
-    """QNet.crop, and its place behind the convolutions' features."""
+    """Return QNet.crop as ONNX operators, appended to the features of the convolutions."""
     return [
         helper.make_node("Slice", [INPUT, "crop.starts", "crop.ends", "crop.axes"], ["crop"]),
         helper.make_node("Flatten", ["crop"], ["near"], axis=1),
@@ -74,7 +74,7 @@ def _layer(name: str) -> list[str]:
 
 
 def _initializers(net: QNet) -> list[Any]:
-    """Weights under their names in the network, and the bounds of the crop."""
+    """Return the weights, by their names in the network, and the bounds of the crop."""
     arrays = {name: w.detach().numpy() for name, w in net.named_parameters()}
     if net.near:
         (top, bottom), (left, right) = (middle(side, net.near) for side in net.shape[1:])

@@ -1,8 +1,8 @@
-"""The gradient of eq. (9) over a minibatch: a share of the minibatch on each thread, and the sum of what they find.
+"""The gradient of eq. (9) over a minibatch: each thread computes a share of the rows, and the results are added.
 
-torch's own threads share each operation instead, and all of them wait for the slowest some thirty times an update: on
-cores that TMC and UAVs need as well, that wait is long. Shares meet once. Those of the other threads begin with
-Q(o, a; theta), which needs no targets, while the first thread computes these; so its own share is the smaller one.
+torch's own threads share each operation instead, and wait for the slowest some thirty times per update: on cores that
+TMC and UAVs also need, that wait is long. Shares wait once. The other threads start with Q(o, a; theta), which needs no
+targets, while the first thread computes the targets; so the first thread's share is smaller.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from learner.qnet import QNet
 from tmc.kernel.config import Config
 
 Share = tuple[list[Tensor], Tensor, Tensor]
-PASSES = 3.0
-"""What a gradient costs, in forward passes of as many observations."""
-STEP = 8
-"""Shares are multiples of this, as far as may be: torch prepares a convolution anew for each number of images."""
+"""(gradient by weight, Q(o, a; theta) of the rows, loss) of a share."""
+GRADIENT_PASSES = 3.0
+"""Cost of a gradient, in forward passes of as many observations."""
+SHARE_STEP_ROWS = 8
+"""Shares are multiples of this where possible, because torch prepares a convolution for each new number of images."""
 
 
 class Gradient:
-    """Of the loss of `net`, on `training.threads` threads; they end with this object."""
+    """Computes gradients of the loss of `net` on `training.threads` threads, which end with this object."""
 
     def __init__(self, net: QNet, config: Config) -> None:
         self.net, self.loss, self.threads = net, config.dqn.loss, config.training.threads
@@ -36,10 +37,10 @@ class Gradient:
     def __call__(
         self, o: Tensor, action: Tensor, target: Callable[[], Tensor], weight: Tensor | None = None, passes: int = 0
     ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-        """(the gradient for each of the weights, Q(o, a; theta) (B,), y (B,), the loss ()), y being what `target` says.
+        """Return (gradient by weight, Q(o, a; theta) (B,), y (B,), loss ()); `target` computes y.
 
         `weight` (B,): as in `dqn.loss`. `passes`: forward passes of an observation that `target` takes. The shares
-        depend on that and on B alone, so the same minibatches give the same weights whatever the threads' pace.
+        depend on `passes` and B alone, so the same minibatches give the same weights at any pace of the threads.
         """
         b, targets = len(action), Future[Tensor]()
         cuts = shares(b, min(self.threads, b), passes)
@@ -48,7 +49,7 @@ class Gradient:
         try:
             targets.set_result(target())
         except BaseException as error:
-            targets.set_exception(error)  # or the helpers would wait for ever
+            targets.set_exception(error)  # otherwise the helpers would wait for ever
             raise
         found = [self._share(*of[0])] if cuts[1] else []
         gradients, q, losses = zip(*found, *(w.result() for w in waiting), strict=True)
@@ -60,7 +61,7 @@ class Gradient:
     def _share(
         self, o: Tensor, action: Tensor, targets: Future[Tensor], rows: slice, weight: Tensor | None, b: int
     ) -> Share:
-        """What these transitions, the `rows` of a minibatch of `b`, have in it."""
+        """Return the part of these transitions, the `rows` of a minibatch of `b`."""
         q, y = self.net(o), targets.result()[rows]
         td = dqn.td_error(q, action, y)
         loss = dqn.loss(td, self.loss, None if weight is None else weight[rows]) * (len(y) / b)
@@ -69,13 +70,14 @@ class Gradient:
 
 
 def shares(b: int, threads: int, passes: int) -> list[int]:
-    """Where each thread's rows of `b` begin, and the last one's end; `threads` is at most b.
+    """Return where each thread's rows of `b` begin, and where the last one's end; `threads` is at most b.
 
-    The first thread has `passes` forward passes to do before its own rows: all have as much to do, as far as that can
-    be, so it may have no rows at all.
+    The first thread does `passes` forward passes before its own rows. All threads get as equal work as possible, so the
+    first may get no rows at all.
     """
     if threads == 1:
         return [0, b]
-    first = max(0.0, ((PASSES * b + passes) / threads - passes) / PASSES)
-    first = round(first / STEP) * STEP if b >= threads * STEP else b // threads
+    first = max(0.0, ((GRADIENT_PASSES * b + passes) / threads - passes) / GRADIENT_PASSES)
+    step = SHARE_STEP_ROWS
+    first = round(first / step) * step if b >= threads * step else b // threads
     return [0, *(first + (b - first) * k // (threads - 1) for k in range(threads))]

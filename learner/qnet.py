@@ -44,7 +44,7 @@ class QNet(nn.Module):
         bottom, right = self.pad
         x = pad(o, (0, right, 0, bottom)) if bottom or right else o
         for conv in self.convs:
-            x = torch.relu_(conv(x))  # in place: what does not fit into the caches costs most
+            x = torch.relu_(conv(x))  # in place, because memory outside the caches costs most
         if x.requires_grad and not x.is_contiguous():
             x.register_hook(as_filters_like)  # type: ignore[no-untyped-call]
         x = x.flatten(1)
@@ -54,33 +54,33 @@ class QNet(nn.Module):
         return values
 
     def crop(self, o: Tensor) -> Tensor:
-        """The middle of the observation: (B, C, 2 near + 1, 2 near + 1)."""
+        """Return the middle of the observation: (B, C, 2 near + 1, 2 near + 1)."""
         (top, bottom), (left, right) = (middle(side, self.near) for side in self.shape[1:])
         return o[:, :, top:bottom, left:right]
 
 
 def as_filters_like(gradient: Tensor) -> Tensor:
-    """The same gradient, channels last: as `flatten` hands it back it would cost 6 % of an update."""
+    """Return the gradient with channels last; the layout that `flatten` gives it would cost 6 % of an update."""
     return gradient.contiguous(memory_format=torch.channels_last)
 
 
 def middle(side: int, near: int) -> tuple[int, int]:
-    """First and one past the last of the 2 near + 1 cells in the middle of `side` cells."""
+    """Return the first, and one past the last, of the 2 near + 1 cells in the middle of `side` cells."""
     return side // 2 - near, side // 2 + near + 1
 
 
 def crop_size(near: int) -> int:
-    """Cells of the crop, 0 when it is off."""
+    """Return the number of cells of the crop, 0 when it is off."""
     return (2 * near + 1) ** 2 if near else 0
 
 
 def build(config: Config, shape: Shape) -> QNet:
-    """The network for observations of this shape, with the initial weights of config.training.seed.
+    """Return the network for observations of this shape, with the initial weights of config.training.seed.
 
-    Same seed, same weights, on any machine and torch version. Raises ConfigError for a view too small for the network.
+    The same seed gives the same weights on any machine and torch version. Raises ConfigError if the view is too small.
     """
     check_view(config, shape)
-    with torch.device("meta"):  # makes no weights yet, so that torch's hidden global generator is left alone
+    with torch.device("meta"):  # without weights, so that torch's global generator is not used
         net = QNet(config.network, shape, config.observation.near)
     net.to_empty(device="cpu")
     initialise(net, config.training.seed)
@@ -89,7 +89,7 @@ def build(config: Config, shape: Shape) -> QNet:
 
 @torch.no_grad()
 def initialise(net: QNet, seed: int) -> None:
-    """Weights and biases uniform in +-1 / sqrt(fan in), torch's own default, from addressed draws: one tick a layer."""
+    """Draw all weights uniform in +-1 / sqrt(fan in), torch's default, by addressed draws: one tick per layer."""
     for i, layer in enumerate((*net.convs, net.dense, net.out)):
         sizes = [p.numel() for p in layer.parameters()]
         u = draws.uniforms(seed, Stream.WEIGHTS, sum(sizes), tick=i)

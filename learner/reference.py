@@ -1,8 +1,8 @@
-"""The textbook loop: the update of Algorithm 1 as anybody would write it in torch, and nothing around it.
+"""The textbook loop: the update of Algorithm 1 in plain torch, without anything around it. Read this first.
 
-`overfly bench learner` compares the learner with it, in speed and in results: contiguous tensors, eager mode, torch's
-default Adam, everything computed every time. `python -m learner.reference` runs it on one minibatch that
-stays in memory.
+It uses contiguous tensors, eager mode and torch's default Adam, and computes everything every time. `overfly bench
+learner` compares the learner with it, in speed and in results. `python -m learner.reference` runs it on one minibatch
+that stays in memory.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from tmc.kernel.policy import view_shape
 from tmc.kernel.world import World
 from tmc.wire import process
 
-WARM = 10
-"""Updates before time is taken."""
+WARM_UP_UPDATES = 10
+"""Updates before the measurement starts."""
 
 
 class ReferenceLearner:
-    """theta, theta- and Adam, from the initial weights of the settings; theta- follows as the trainer's does."""
+    """Holds theta, theta- and Adam, from the initial weights of the settings; theta- is copied as in the trainer."""
 
     def __init__(self, config: Config, shape: qnet.Shape) -> None:
         self.config = config
@@ -43,7 +43,7 @@ class ReferenceLearner:
         self.updates = self.copied = 0
 
     def follow(self, episodes: int) -> None:
-        """theta- = theta, when so many finished episodes or the updates so far make it due."""
+        """Copy theta to theta-, if the number of finished episodes or of updates makes it due."""
         every = self.config.dqn.target_updates
         if copy_due(episodes, self.copied, self.config.dqn.target_episodes):
             self.copied = episodes
@@ -52,7 +52,7 @@ class ReferenceLearner:
         self.target.load_state_dict(self.online.state_dict())
 
     def update(self, batch: Tensors) -> None:
-        """One step of Adam on eq. (9)."""
+        """Make one step of Adam on eq. (9)."""
         d = self.config.dqn
         with torch.no_grad():
             choice = self.online(batch.o_next) if d.double else None
@@ -79,7 +79,7 @@ class Tensors:
 
 
 def resident(config: Config, shape: qnet.Shape) -> Batch:
-    """A minibatch of noise, for timing: what is in it does not change what is computed."""
+    """Return a minibatch of noise, for timing: its values do not change the amount of work."""
     rng, b = np.random.Generator(np.random.Philox(1)), config.dqn.batch_size
     o, o_next = (rng.random((b, *shape), np.float32) for _ in range(2))
     action, reward = rng.integers(0, N_ACTIONS, b).astype("u1"), rng.random(b, np.float32)
@@ -88,25 +88,25 @@ def resident(config: Config, shape: qnet.Shape) -> Batch:
 
 
 def rate(config: Config, seconds: float) -> float:
-    """Updates a second of the textbook loop, on as many threads as the settings say."""
+    """Measure the updates per second of the textbook loop over `seconds`, on `training.threads` threads."""
     torch.set_num_threads(config.training.threads)
     shape = view_shape(config, World(config).grid)
-    bare, batch = ReferenceLearner(config, shape), Tensors(resident(config, shape))
-    for _ in range(WARM):
-        bare.update(batch)
+    reference, batch = ReferenceLearner(config, shape), Tensors(resident(config, shape))
+    for _ in range(WARM_UP_UPDATES):
+        reference.update(batch)
     start = time.perf_counter()
     while time.perf_counter() < start + seconds:
-        bare.update(batch)
-    return (bare.updates - WARM) / (time.perf_counter() - start)
+        reference.update(batch)
+    return (reference.updates - WARM_UP_UPDATES) / (time.perf_counter() - start)
 
 
 @dataclass(frozen=True)
 class Departures:
-    """How far gradients of float32 are from the exact ones: the largest of all updates.
+    """The largest errors, over all updates, of float32 gradients against exact ones.
 
-    `learner`, `textbook`: the trainer's and the textbook loop's, relative to the gradient's length. `of_bound`: the
-    trainer's, in any one weight, relative to the most that rounding can do there (`learner.rounding`). Above 1, the
-    trainer computes something else.
+    `learner`, `textbook`: of the trainer and of the textbook loop, relative to the gradient's length. `of_bound`: of
+    the trainer in any one weight, relative to the bound of rounding errors there (`learner.rounding`). Above 1, the
+    trainer computes something else than eq. (9).
     """
 
     learner: float
@@ -115,39 +115,39 @@ class Departures:
 
 
 def departures(config: Config, batches: Iterable[Batch]) -> Departures:
-    """Compare the trainer's gradient of each update with the exact one, and the textbook loop's with that too.
+    """Compare the gradients of the trainer and of the textbook loop with the exact one, at each update.
 
-    Before each update the textbook loop gets the trainer's theta, and the exact gradient is taken there; theta- follows
-    by itself. Left alone, two loops drift apart by rounding that every step enlarges, and a mistake would hide in that.
+    Before each update the textbook loop gets the trainer's theta, and the exact gradient is computed there; theta- is
+    copied by its own schedule. Two independent loops would drift apart by rounding, and a mistake would hide in that.
     """
     torch.set_num_threads(1)  # as `trainer.start` does
     grid = World(config).grid
     shape = view_shape(config, grid)
-    trainer, bare = Trainer(config, shape, grid), ReferenceLearner(config, shape)
+    trainer, reference = Trainer(config, shape, grid), ReferenceLearner(config, shape)
     found = [torch.zeros(3, dtype=torch.float64)]
     for batch in batches:
-        bare.online.load_state_dict(trainer.online.state_dict())
-        bare.follow(batch.episodes)
-        exact, bound = rounding.gradient(config, bare.online, bare.target, batch)
-        bare.update(Tensors(batch))
+        reference.online.load_state_dict(trainer.online.state_dict())
+        reference.follow(batch.episodes)
+        exact, bound = rounding.gradient(config, reference.online, reference.target, batch)
+        reference.update(Tensors(batch))
         trainer.update(batch)
-        mine, plain = (gradient(net).double() - exact for net in (trainer.online, bare.online))
+        tuned, plain = (gradient(net).double() - exact for net in (trainer.online, reference.online))
         length = exact.norm().clamp_min(torch.finfo(torch.float32).tiny)
-        found.append(torch.stack((mine.norm() / length, plain.norm() / length, (mine.abs() / bound).max())))
+        found.append(torch.stack((tuned.norm() / length, plain.norm() / length, (tuned.abs() / bound).max())))
     return Departures(*torch.stack(found).amax(0).tolist())  # NaN stays NaN
 
 
 def gradient(net: qnet.QNet) -> torch.Tensor:
-    """Of the last update, over all weights."""
+    """Return the gradient of the last update, over all weights, in one row."""
     return torch.cat([p.grad.flatten() for p in net.parameters() if p.grad is not None])
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print the updates a second."""
+    """Print the updates per second."""
     parser = argparse.ArgumentParser("learner.reference", description=__doc__, allow_abbrev=False)
     parser.add_argument("--config", type=Path, required=True, help="settings as JSON, dotted keys")
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
     a = parser.parse_args(argv)
     process.become_child(a.parent)
     print(rate(build(json.loads(a.config.read_text("utf-8"))), a.seconds))

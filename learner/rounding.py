@@ -1,19 +1,19 @@
-"""How far rounding may take the gradient of eq. (9), computed beside the exact one: a law on every processor.
+"""Bounds the rounding error of the gradient of eq. (9), beside the exact gradient. The bound holds on every processor.
 
-Two computations whose sums have another order give the same float32 numbers on one processor and others on the next, so
-neither "the same" nor "not the same" can be asked of them. What can: in float32, whatever the order, the number of
-threads and the instructions, a sum of n products departs from the exact sum by at most
+Two computations that add in another order give equal float32 numbers on one processor and different ones on the next,
+so a test can require neither. It can require this: in float32, for any order, number of threads and instructions, a sum
+of n products departs from the exact sum by at most
 
     gamma(n) sum |a_i b_i|,    gamma(n) = n u / (1 - n u),    u = eps / 2 = 2^-24
 
-(Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., eq. 3.5). Every layer, forward and backward, is such
-sums. `Ball` carries the value, in float64, and the bound of what came before; `product` adds what one more layer may.
-So the bound follows from eps, from the numbers of terms (weights of a filter, outputs of a layer, rows of a minibatch
-times places of a filter) and from the sizes of the numbers. It is a worst case: what rounding really does is a
-hundredth of it or less. float64's own rounding is 2^-29 of the bound.
+(Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., eq. 3.5). Every layer, forward and backward, is made
+of such sums. `Ball` carries the value in float64 and the bound so far; `product` adds the bound of one more layer. So
+the bound follows from eps, from the numbers of terms (weights of a filter, outputs of a layer, rows of a minibatch
+times places of a filter) and from the sizes of the numbers. It is a worst case: the real error is a hundredth of it or
+less. float64's own rounding is 2^-29 of the bound.
 
 *Kinks.* Where rounding may move the input of a ReLU across zero, the gradient may have all of that unit's part or none
-of it, so all of it is added to the bound. In double Q-learning rounding may choose another action: the bound reaches to
+of it, so all of it is added to the bound. In double Q-learning rounding may choose another action, so the bound covers
 the value of every action that it may choose.
 """
 
@@ -33,39 +33,39 @@ from learner.batching import Batch
 from learner.qnet import QNet
 from tmc.kernel.config import Config
 
-FEW = 8
-"""Roundings of what is no sum: r + gamma Q, Q - y, and the loss with its weights and shares have fewer each."""
+ELEMENTWISE_ROUNDINGS = 8
+"""At least the roundings of each elementwise step: r + gamma Q, Q - y, and the loss with its weights and shares."""
 
 
 def gamma(n: int) -> float:
-    """What a sum of n products may depart by, of the sum of their sizes."""
+    """Return the bound on the error of a sum of n products, relative to the sum of their sizes."""
     u = torch.finfo(torch.float32).eps / 2
     return n * u / (1 - n * u)
 
 
 @dataclass(frozen=True)
 class Ball:
-    """Whatever float32 computes here lies within `error` of `value`, place by place; both float64, of one shape."""
+    """The numbers within `error` of `value`, elementwise: float32 computes one of them. Both float64, of one shape."""
 
     value: Tensor
     error: Tensor
 
     def size(self) -> Tensor:
-        """No number in it is farther from zero."""
+        """Return the largest absolute value in it, elementwise."""
         return self.value.abs() + self.error
 
     def rounded(self, n: int, sizes: Tensor) -> Ball:
-        """The same after n roundings of numbers that add up to `sizes`, or vanish because they are too small."""
+        """Return the ball after n roundings of numbers that add up to `sizes`, or underflow."""
         return Ball(self.value, self.error + gamma(n) * sizes + n * torch.finfo(torch.float32).tiny)
 
 
 def exact(x: Tensor) -> Ball:
-    """What is given, in float32 or less."""
+    """Return the ball of numbers that are given exactly, in float32 or less."""
     return Ball(x.double(), torch.zeros(x.shape, dtype=torch.float64))
 
 
 def product(f: Callable[[Tensor, Tensor], Tensor], a: Ball, b: Ball, n: int) -> Ball:
-    """`f` of two balls: a bilinear map, whose results are sums of at most n products each."""
+    """Return `f` of two balls; `f` is a bilinear map whose results are sums of at most n products each."""
     sizes = f(a.size(), b.size())
     return Ball(f(a.value, b.value), sizes - f(a.value.abs(), b.value.abs())).rounded(n, sizes)
 
@@ -80,7 +80,7 @@ class Layer:
         self.x = self.z = self.b
 
     def forward(self, x: Ball) -> Ball:
-        """z, which `backward` needs again."""
+        """Return z; keep it and x for `backward`."""
 
         def f(x: Tensor, w: Tensor) -> Tensor:
             return conv2d(x, w, stride=self.stride) if self.stride else x @ w.T
@@ -91,7 +91,7 @@ class Layer:
         return self.z
 
     def backward(self, d: Ball) -> list[Ball]:
-        """The gradients for w and b, from `d`, that for z."""
+        """Return the gradients for w and b, from `d`, the gradient for z."""
 
         def f(d: Tensor, x: Tensor) -> Tensor:
             if not self.stride:
@@ -104,7 +104,7 @@ class Layer:
         return [product(f, d, self.x, n), bias]
 
     def inward(self, d: Ball) -> Ball:
-        """The gradient for x."""
+        """Return the gradient for x, from `d`, the gradient for z."""
 
         def f(d: Tensor, w: Tensor) -> Tensor:
             if not self.stride:
@@ -116,18 +116,18 @@ class Layer:
 
 
 def relu(z: Ball) -> Ball:
-    """Rectified: no two numbers get farther apart."""
+    """Return relu(z); it moves no two numbers farther apart, so the error stays."""
     return Ball(z.value.relu(), z.error)
 
 
 def unrelu(d: Ball, z: Ball) -> Ball:
-    """`d`, the gradient for relu(z), as that for z: all of it is in doubt where z may be on either side of zero."""
+    """Return the gradient for z, from `d`, that for relu(z); where z may have either sign, all of `d` is error."""
     on, doubt = z.value > 0, z.value.abs() <= z.error
     return Ball(d.value * on, torch.where(doubt, d.size(), d.error * on))
 
 
 class Net:
-    """The layers of a network, with what went through them last."""
+    """The layers of a network, with the inputs and outputs of the last forward pass."""
 
     def __init__(self, net: QNet) -> None:
         self.net = net
@@ -135,7 +135,7 @@ class Net:
         self.dense, self.out = Layer(net.dense), Layer(net.out)
 
     def forward(self, o: Tensor) -> Ball:
-        """Q(o, .), shape (B, 9)."""
+        """Return Q(o, .), shape (B, 9)."""
         bottom, right = self.net.pad
         x = exact(pad(o, (0, right, 0, bottom)))
         for conv in self.convs:
@@ -146,7 +146,7 @@ class Net:
         return self.out.forward(relu(self.dense.forward(x)))
 
     def backward(self, d: Ball) -> list[Ball]:
-        """The gradient for each of `parameters()`, in their order, from `d`, that for Q(o, .)."""
+        """Return the gradient for each of `parameters()`, in their order, from `d`, that for Q(o, .)."""
         inner = unrelu(self.out.inward(d), self.dense.z)
         found = [self.out.backward(d), self.dense.backward(inner)]
         into, shape = self.dense.inward(inner), self.convs[-1].z.value.shape
@@ -159,7 +159,10 @@ class Net:
 
 
 def best(q: Ball, allowed: Tensor, choice: Ball) -> Ball:
-    """The value in `q` of the action that `choice` likes best: any that rounding may make the best. Shape (B,)."""
+    """Return the value in `q` of the best action by `choice`; the error covers all that rounding may make the best.
+
+    Shape (B,).
+    """
     least = (choice.value - choice.error).masked_fill(allowed == 0, -torch.inf).amax(1, keepdim=True)
     may = (choice.value + choice.error >= least) & (allowed != 0)
     chosen = choice.value.masked_fill(allowed == 0, -torch.inf).argmax(1, keepdim=True)
@@ -168,9 +171,9 @@ def best(q: Ball, allowed: Tensor, choice: Ball) -> Ball:
 
 
 def gradient(config: Config, online: QNet, target: QNet, batch: Batch) -> tuple[Tensor, Tensor]:
-    """(the gradient of eq. (9) in theta, how far any float32 computation of it may be from that), all weights in a row.
+    """Return (gradient of eq. (9) in theta, largest error of any float32 computation of it), all weights in one row.
 
-    The equations stand here once more, so that a mistake in those that the learner uses shows.
+    The equations are written here again, independently, so that a mistake in the learner's own shows.
     """
     d, b = config.dqn, len(batch.action)
     o, o_next = torch.tensor(batch.observation), torch.tensor(batch.next_observation(np.arange(b)))
@@ -178,13 +181,16 @@ def gradient(config: Config, online: QNet, target: QNet, batch: Batch) -> tuple[
     q_next, theta = Net(target).forward(o_next), Net(online)
     v = best(q_next, torch.tensor(batch.allowed), theta.forward(o_next) if d.double else q_next)
     r = r * d.reward_scale
-    y = Ball(r + discount * v.value, discount * v.error).rounded(FEW, r.abs() + discount * v.size())
+    y = Ball(r + discount * v.value, discount * v.error).rounded(ELEMENTWISE_ROUNDINGS, r.abs() + discount * v.size())
     q, rows, action = theta.forward(o), torch.arange(b), torch.tensor(batch.action).long()
-    mine = Ball(q.value[rows, action], q.error[rows, action])
-    td = Ball(mine.value - y.value, mine.error + y.error).rounded(FEW, mine.size() + y.size())
+    chosen = Ball(q.value[rows, action], q.error[rows, action])
+    td = Ball(chosen.value - y.value, chosen.error + y.error)
+    td = td.rounded(ELEMENTWISE_ROUNDINGS, chosen.size() + y.size())
     slope = Ball(td.value.clamp(-1, 1), td.error) if d.loss == "huber" else Ball(2 * td.value, 2 * td.error)
     weight = torch.tensor(batch.weight).double() if batch.weight.size else torch.ones(b, dtype=torch.float64)
-    slope = Ball(slope.value * weight / b, slope.error * weight / b).rounded(FEW, slope.size() * weight / b)
+    slope = Ball(slope.value * weight / b, slope.error * weight / b).rounded(
+        ELEMENTWISE_ROUNDINGS, slope.size() * weight / b
+    )
     into = exact(torch.zeros(q.value.shape))
     into.value[rows, action], into.error[rows, action] = slope.value, slope.error
     balls = theta.backward(into)

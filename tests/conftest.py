@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,14 @@ settings.load_profile("overfly")
 
 for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "PYTHONWARNINGS"):
     os.environ.pop(name, None)  # what the user's terminal and other programs are to do is no setting of the tests
+
+# A suite that a script runs in the background has INT ignored, and so would the commands that it starts; nohup: HUP.
+signal.pthread_sigmask(signal.SIG_SETMASK, [])
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL),
+                        (signal.SIGTERM, signal.SIG_DFL), (signal.SIGTSTP, signal.SIG_DFL),
+                        (signal.SIGCHLD, signal.SIG_DFL)):  # fmt: skip
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 TRAINED = ("run", "quick", "--ticks", 60, "--episodes", 2, "--no-pictures",

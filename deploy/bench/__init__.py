@@ -1,1 +1,1 @@
-"""What `overfly bench` measures: one module a bench, with `add_arguments(parser)` and `measure(args)`."""
+"""The benches of `overfly bench`: one module per bench, with `add_arguments(parser)` and `measure(args)`."""

@@ -1,8 +1,7 @@
-"""`overfly bench actor`: whole steps of a UAV (sense, observe, decide, move, reward, record) against the textbook call
-of ONNX Runtime on one image, in one process on one thread, in turns.
+"""`overfly bench actor`: whole steps of a UAV against textbook calls of ONNX Runtime on one image.
 
-A pilot flies the network of the settings, with its first weights, in a team; the TMC's part is not
-timed. Times are the processor's.
+A step is: sense, observe, decide, move, reward, record. Both run in turns, in one process on one thread. The pilots of
+a team fly the network of the settings with its initial weights. The TMC's part is not timed. Times are processor time.
 """
 
 from __future__ import annotations
@@ -27,18 +26,20 @@ from tmc.kernel.policy import INPUT, OUTPUT
 from tmc.kernel.world import World
 from tmc.wire import messages as m
 
-AIM = 0.4
-"""The share of a whole step that the network should have at least."""
+MIN_SHARE = 0.4
+"""The least share of a whole step that the network should take."""
+TEXTBOOK = f"x textbook calls/s, aim {MIN_SHARE:g}"
+"""The reference of the steps per second."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
-    parser.add_argument("--repeats", type=int, default=5, metavar="R", help="medians of so many episodes (default: 5)")
+    parser.add_argument("--repeats", type=int, default=5, metavar="R", help="episodes to take medians of (default: 5)")
     settings.add_options(parser)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Fly episodes, with as many textbook calls after each stretch as it had steps."""
+    """Fly episodes, with one textbook call per step after each stretch; return the rows. Raises ConfigError."""
     bounds.number("--repeats", args.repeats, 1)
     values = {**policy_spec.FIXED, "training.episodes": args.repeats, **settings.chosen(args)}
     world = check(settings.config_for("paper", values))
@@ -49,23 +50,23 @@ def measure(args: argparse.Namespace) -> list[Row]:
     share = median(call / step for step, call in flown)
     case = f"N={world.config.team.size}"
     return [
-        Row("actor", f"{case} a whole step", 1e6 * steps, "us", 1e6 * calls, share, "the call of ONNX Runtime / step"),
-        Row("actor", f"{case} steps", 1 / steps, "UAV steps/s", 1 / calls, share, f"x textbook calls/s, aim {AIM:g}"),
+        Row("actor", f"{case} whole step", 1e6 * steps, "us", 1e6 * calls, share, "ONNX Runtime call / step"),
+        Row("actor", f"{case} steps", 1 / steps, "UAV steps/s", 1 / calls, share, TEXTBOOK),
     ]
 
 
 def first_policy(world: World) -> bytes:
-    """The policy file of a learner that has not learned yet."""
-    from learner.trainer import start  # noqa: PLC0415  torch only for those who measure this
+    """Return the policy file of a learner that has not learned yet."""
+    from learner.trainer import start  # noqa: PLC0415  torch only for this bench
 
     return start(world.config, world.grid).policy()[1]
 
 
 class Team:
-    """Pilots in one process, in lock step, and a TMC whose time is not theirs."""
+    """Pilots in one process, in lock step, and a TMC whose time is subtracted."""
 
     def __init__(self, world: World, policy: bytes) -> None:
-        from actors.policy import PolicyController, open_model  # noqa: PLC0415  ONNX Runtime only for those who measure this
+        from actors.policy import PolicyController, open_model  # noqa: PLC0415  ONNX Runtime only for this bench
 
         config, observer = world.config, ObservationBuilder(world)
         self.station = Station(world, "bench", policy=policy, learning=False)
@@ -89,7 +90,7 @@ class Team:
         return [(int(to.removeprefix("uav-")), answer) for to, answer in sends if to.startswith("uav-")]
 
     def fly(self, episode: int) -> tuple[float, float]:
-        """Seconds a whole step, and seconds a textbook call, in the rest of an episode."""
+        """Fly the rest of an episode; return (s per whole step, s per textbook call)."""
         spent = textbook = 0.0
         before = flown = self._steps()
         while self.station.episode is not None and self.station.episode.number == episode:
@@ -104,7 +105,7 @@ class Team:
         return sum(pilot.steps for pilot in self.fleet.pilots)
 
     def _calls(self, count: int) -> float:
-        """Seconds of as many forward passes of one image, as anybody would call them."""
+        """Return the time (s) of `count` textbook forward passes of one image."""
         run, names, image = self._session.run, [OUTPUT], {INPUT: self._image}
         start = time.process_time()
         for _ in range(count):

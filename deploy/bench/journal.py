@@ -1,7 +1,7 @@
-"""`overfly bench journal`: what the TMC's journal takes, what a commit costs, and how many bytes a UAV step leaves.
+"""`overfly bench journal`: the rate of the TMC's journal, the cost of a commit, and the bytes per UAV step.
 
-The entries are those of a real flight. They go through the real journal into a real file, with commits as the TMC makes
-them: at full speed, and at the pace of a flight of processes that was measured just before.
+The entries are those of a real flight. They go through the real journal into a real file, with commits as in the TMC:
+at full speed, and at the pace of a flight of processes that was measured just before.
 """
 
 from __future__ import annotations
@@ -27,46 +27,52 @@ from tmc.center.roster import Outbox
 from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.world import World
 from tmc.record.mcap.compact import compact_log
-from tmc.record.reader import Log, run_files
+from tmc.record.reader import Log
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 from tmc.wire import process
 
 NONE = "none"
 CASES = (NONE, "process", "power")
-"""Values of `journal.durability`; with `none`, nothing is committed: what the others are held against."""
+"""Values of `journal.durability`, and `none`, the reference, in which nothing is committed."""
 SYNCS = 50
-"""Commits after each of which the time of an fsync is taken."""
+"""Commits after each of which an fsync is timed."""
 
 
 @dataclass
 class Run:
-    """One stretch of journalling: records and commits, seconds of the wall clock and of the processor."""
+    """One stretch of journalling: records and commits, wall time (s) and processor time (s)."""
 
     records: int = 0
     wall: float = 0.0
     cpu: float = 0.0
     commits: list[float] = field(default_factory=list)
-    """Seconds of each commit."""
+    """Time (s) of each commit."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
-    parser.add_argument("--dir", type=Path, default=Path(), help="folder on the disk to measure (default: this one)")
-    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
-    parser.add_argument("--seconds", type=float, default=2.0, metavar="S", help="of each stretch (default: 2)")
+    parser.add_argument(
+        "--dir", type=Path, default=Path(), help="folder on the disk to measure (default: the current one)"
+    )
+    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="turns to take medians of (default: 3)")
+    parser.add_argument("--seconds", type=float, default=2.0, metavar="S", help="length of each stretch (default: 2)")
     parser.add_argument(
         "--pace", type=float, default=0.0, metavar="P",
-        help="flight records a second for the share of a core (default: those of a flight; a training has 60)",
+        help="flight records per second for the share of a core (default: those of a flight; a training has 60)",
     )  # fmt: skip
     settings.add_options(parser)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Fly once in processes, once in lock step, and journal that again and again; one row a figure."""
+    """Fly once in processes and once in lock step, and journal that repeatedly; return one row per figure.
+
+    Raises ConfigError.
+    """
     bounds.stretches(args.repeats, args.seconds, 2 * len(CASES))
     bounds.number("--pace", args.pace, 0.0)
     if not args.dir.is_dir():
-        raise ConfigError(f"--dir {args.dir} is no folder: choose one on the disk that runs are written to")
+        raise ConfigError(f"--dir {args.dir} is not a folder: choose one on the disk that runs are written to")
     pilot = policy_spec.resolve("planner:greedy")
     world = check(build(policy_spec.mission_values(pilot, {"team.size": 10}, settings.chosen(args))))
     bounds.missions(world)
@@ -75,7 +81,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
         flown = folder / "flown"
         flown.mkdir()
         rate = rollout.fly_processes(world, None, flown, table=True, weigh=False).rate
-        _say(f"N = {world.config.team.size}: flown by processes, {rate:,.0f} UAV steps a second")
+        _print_progress(f"N = {world.config.team.size}: flown by processes, {rate:,.0f} UAV steps per second")
         outboxes = fly(world)
         pace = args.pace or rate * sum(map(records_in, outboxes)) / steps_of(world.config)
         rows = list(_speed(world, outboxes, pace, folder, args))
@@ -84,17 +90,17 @@ def measure(args: argparse.Namespace) -> list[Row]:
 
 
 def steps_of(config: Config) -> int:
-    """UAV steps of a mission."""
+    """Return the UAV steps of a mission."""
     return config.team.size * config.training.ticks * config.training.episodes
 
 
 def records_in(outbox: Outbox) -> int:
-    """EpisodeState records among the entries."""
+    """Return the number of flight records among the entries."""
     return sum("record" in entry.values for entry in outbox.entries)
 
 
 def fly(world: World) -> list[Outbox]:
-    """What the TMC journals in a mission, in lock step."""
+    """Fly a mission in lock step; return the entries that the TMC journals."""
     outboxes: list[Outbox] = []
     lockstep.LockStep(world, None, outboxes.append).run()
     return [Outbox(entries=outbox.entries) for outbox in outboxes if outbox.entries]
@@ -104,38 +110,38 @@ def fly(world: World) -> list[Outbox]:
 
 
 def _speed(world: World, outboxes: list[Outbox], pace: float, folder: Path, args: argparse.Namespace) -> Iterator[Row]:
-    """The cases take turns, so that all of them see the same machine."""
+    """Yield rates and costs of each case; the cases take turns, so that the machine is the same for all."""
     full: dict[str, list[Run]] = {case: [] for case in CASES}
     paced: dict[str, list[Run]] = {case: [] for case in CASES}
     for _ in range(args.repeats):
         for case in CASES:
             full[case].append(stretch(world, case, outboxes, folder, args.seconds))
             paced[case].append(stretch(world, case, outboxes, folder, args.seconds, pace))
-        said = ", ".join(f"{case} {rate_of(full[case][-1]):,.0f}" for case in CASES)
-        _say(f"records a second: {said}")
+        rates = ", ".join(f"{case} {rate_of(full[case][-1]):,.0f}" for case in CASES)
+        _print_progress(f"records per second: {rates}")
     base = [rate_of(run) for run in full[NONE]]
     for case in CASES:
-        rates = [rate_of(run) for run in full[case]]
-        ratio = median(a / b for a, b in zip(rates, base, strict=True))
-        yield Row("journal", case, median(rates), "records/s", median(base), ratio, "x no commits")
+        of_case = [rate_of(run) for run in full[case]]
+        ratio = median(a / b for a, b in zip(of_case, base, strict=True))
+        yield Row("journal", case, median(of_case), "records/s", median(base), ratio, "x no commits")
         share = median(run.cpu / run.wall for run in paced[case])
         yield Row("journal", f"{case} at {pace:,.0f} records/s", share, "share of a core")
         if case != NONE:
             commits = [seconds for run in paced[case] for seconds in run.commits]
-            a_second = median(len(run.commits) / run.wall for run in paced[case])
-            yield Row("journal", f"{case} commits", a_second, "commits/s")
+            per_second = median(len(run.commits) / run.wall for run in paced[case])
+            yield Row("journal", f"{case} commits", per_second, "commits/s")
             yield Row("journal", f"{case} commit", 1e3 * median(commits) if commits else None, "ms, median")
 
 
 def rate_of(run: Run) -> float:
-    """Records a second."""
+    """Return the records per second."""
     return run.records / run.wall
 
 
 def stretch(
     world: World, case: str, outboxes: Iterable[Outbox], folder: Path, seconds: float, pace: float | None = None
 ) -> Run:
-    """Journal for so many seconds, at `pace` records a second or as fast as it goes."""
+    """Journal for `seconds`, at `pace` records per second or at full speed."""
     run, journal = Run(), _journal(world, case, folder)
     begin, cpu = time.perf_counter(), time.process_time()
     try:
@@ -157,7 +163,7 @@ def stretch(
 
 
 def _commit(run: Run, journal: Journal, case: str) -> None:
-    """As the TMC's loop does."""
+    """Commit when due, as the TMC's loop does, and time it."""
     if case != NONE and journal.due == 0.0:
         begin = time.perf_counter()
         journal.commit()
@@ -165,7 +171,7 @@ def _commit(run: Run, journal: Journal, case: str) -> None:
 
 
 def fsyncs(world: World, outboxes: list[Outbox], folder: Path) -> list[float]:
-    """Seconds until the disk has what a commit handed to the system, as often as the TMC commits."""
+    """Return the times (s) of fsyncs, each after a commit, at the commit interval of the TMC."""
     journal, found = _journal(world, "process", folder), []
     number = os.open(journal.writer.active, os.O_RDONLY)
     try:
@@ -197,7 +203,7 @@ def _remove(journal: Journal) -> None:
 
 
 def _sizes(world: World, flown: Path, folder: Path) -> Iterator[Row]:
-    """Bytes a UAV step of the flight of processes, and the seconds of `overfly log check`."""
+    """Yield the bytes per UAV step of the flight of processes, and the time of `overfly log check`."""
     alone = records_alone(world.config, flown, folder)
     steps = steps_of(world.config)
     for case, files in (("all topics of all files", [*run_files(flown).values()]), ("flight records alone", [alone])):
@@ -213,7 +219,7 @@ def _sizes(world: World, flown: Path, folder: Path) -> Iterator[Row]:
 
 
 def records_alone(config: Config, flown: Path, folder: Path) -> Path:
-    """A log with the flight records of a run and nothing else, in as many commits."""
+    """Write a log with only the flight records of a run, in as many commits; return its path."""
     path = folder / "tmc.mcap"
     with LogWriter(path, "tmc", config.journal, {}) as log:
         due = 0
@@ -226,5 +232,5 @@ def records_alone(config: Config, flown: Path, folder: Path) -> Path:
     return path
 
 
-def _say(text: str) -> None:
+def _print_progress(text: str) -> None:
     process.tell(text, prefix="")

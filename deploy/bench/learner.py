@@ -1,8 +1,8 @@
-"""`overfly bench learner`: the learner of a running mission against the textbook compute loop, in speed and in results.
+"""`overfly bench learner`: the learner of a running mission against the textbook loop, in speed and in results.
 
-The mission is the paper's with a memory of 1,500 transitions and a target that follows every 75 updates: each
-transition is drawn 6.4 times before theta- changes and 15 % of them are new then, as with the paper's 100,000 and
-5,000, so as many values of theta- are known when they are needed. Its memory is full after seconds, not half an hour.
+The mission is the paper's, with a replay memory of 1,500 transitions and a target copy every 75 updates. Each
+transition is drawn 6.4 times before theta- changes, and 15 % of them are new then, as with the paper's 100,000 and
+5,000; so the target cache has as many hits. The memory is full after seconds instead of half an hour.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from tmc.center.replay import Replay
 from tmc.kernel import observation
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.world import World
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import run_files
 from tmc.wire import messages, process
 from tmc.wire.messages import Minibatch
 
@@ -40,18 +41,22 @@ if TYPE_CHECKING:
 
 SCALED = {"replay.capacity": 1500, "dqn.target_episodes": 0, "dqn.target_updates": 75}
 MISSION = {**SCALED, "training.episodes": 1_000_000}
-"""It is stopped, not finished."""
+"""The bench stops the mission before its end."""
 POLL_S = 0.05
-"""Seconds between two looks at the processes."""
+"""Interval (s) at which the processes are checked."""
 TUNED = "in the learner's environment"
-"""Memory is kept and idle threads sleep, as in the learner; what that alone is worth shows."""
-TICK = os.sysconf("SC_CLK_TCK")
+"""Freed memory is kept and idle threads sleep, as in the learner. This row shows the effect of that alone."""
+CLOCK_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+CPU_UNIT = "ms of processor time per update"
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A stretch of a mission: updates and ticks a second; seconds from its start to the first update; MiB of all
-    processes; the learner's idle share; ms of the processor an update, by role."""
+    """A stretch of a mission.
+
+    `rate`: updates per second. `ticks`: ticks per second. `start`: s from the start of the mission to its first update.
+    `memory`: MiB of all processes. `idle`: the learner's idle share. `cpu`: ms of processor time per update, by role.
+    """
 
     rate: float
     ticks: float
@@ -63,9 +68,11 @@ class Learned:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
-    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each stretch (default: 10)")
-    parser.add_argument("--threads", type=int, default=2, metavar="N", help="of the learner and the loop (default: 2)")
+    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="turns to take medians of (default: 3)")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="length of each stretch (default: 10)")
+    parser.add_argument(
+        "--threads", type=int, default=2, metavar="N", help="threads of the learner and of the loop (default: 2)"
+    )
     parser.add_argument(
         "--steps", type=int, default=300, metavar="U", help="updates whose results are compared (default: 300)"
     )
@@ -73,7 +80,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """ReferenceLearner loop and mission in turns, then the comparison of results; one row a figure."""
+    """Run the textbook loop and a mission in turns, then compare results; return one row per figure.
+
+    Raises ConfigError.
+    """
     bounds.stretches(args.repeats, args.seconds, 3)
     bounds.number("--steps", args.steps, 0, 1e-3)
     values = {**MISSION, "training.threads": args.threads, **settings.chosen(args)}
@@ -87,7 +97,9 @@ def measure(args: argparse.Namespace) -> list[Row]:
             textbook.append(reference_loop(world.config, args.seconds, "textbook"))
             flown.append(fly(world, args.seconds, Path(tempfile.mkdtemp(dir=scratch))))
             tuned.append(reference_loop(world.config, args.seconds, "learner"))
-            say(f"textbook loop {textbook[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s")
+            print_progress(
+                f"textbook loop {textbook[-1]:.1f}, {TUNED} {tuned[-1]:.1f}, learner {flown[-1].rate:.1f} updates/s"
+            )
     rows = list(_rows(world.config, flown, textbook, tuned))
     return rows + (list(compare(world, args.steps)) if args.steps else [])
 
@@ -101,20 +113,20 @@ def _rows(config: Config, flown: list[Learned], textbook: list[float], tuned: li
 
 
 def shares(bench: str, case: str, flown: list[Learned]) -> Iterator[Row]:
-    """How long the learner waited, and who used the processor."""
+    """Yield the learner's idle share, and the processor time per update by role."""
     idle = [f.idle for f in flown if f.idle is not None]
     yield Row(bench, f"{case} idle", median(idle) if idle else None, "share of time")
     for role in flown[0].cpu:
-        yield Row(bench, f"{case} {role}", median(f.cpu[role] for f in flown), "ms of CPU an update")
+        yield Row(bench, f"{case} {role}", median(f.cpu[role] for f in flown), CPU_UNIT)
 
 
-def say(text: str) -> None:
-    """Progress."""
+def print_progress(text: str) -> None:
+    """Print a line of progress to stderr."""
     process.tell(text, prefix="")
 
 
 def reference_loop(config: Config, seconds: float, name: str) -> float:
-    """Updates a second of `learner.reference` in a process of its own, with the environment of process `name`."""
+    """Return the updates per second of `learner.reference` in a separate process, with the environment of `name`."""
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         file.write(json.dumps(flat(config)))
         file.flush()
@@ -125,7 +137,7 @@ def reference_loop(config: Config, seconds: float, name: str) -> float:
 
 
 def fly(world: World, seconds: float, out: Path) -> Learned:
-    """A mission in processes of its own; time is taken once the memory is full and theta- has changed."""
+    """Fly a mission of processes; measure it once the replay memory is full and theta- has changed."""
     config = world.config
     warm = warm_up(config)
     begun = time.monotonic()
@@ -143,15 +155,15 @@ def fly(world: World, seconds: float, out: Path) -> Learned:
 
 
 def warm_up(config: Config) -> int:
-    """Updates after which the memory is full and theta- has changed."""
+    """Return the updates after which the memory is full and theta- has changed."""
     return config.replay.capacity // config.team.size + config.dqn.target_updates
 
 
 def _wait(
     supervisor: Supervisor, observer: StatusPoller, updates: int = 0, until: float = 0.0
 ) -> tuple[float, messages.Status]:
-    """(seconds of the clock, status) when there have been `updates`, and the clock is past `until`."""
-    pace = bounds.Pace("the updates that come before:", updates)
+    """Wait for `updates`, and until `until` (s of the monotonic clock); return (time, status). Raises ConfigError."""
+    pace = bounds.Pace("the updates before the measurement:", updates)
     while True:
         if supervisor.watch():
             raise ConfigError("the mission was over before it was measured: give it more --episodes or --ticks")
@@ -164,26 +176,26 @@ def _wait(
 
 
 def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
-    """Seconds of the processor so far, by role: learner, TMC, and all UAVs together."""
+    """Return the processor time (s) so far, by role: learner, TMC, and all UAVs together."""
     spent = dict.fromkeys(("learner", "tmc", "uavs"), 0.0)
     for name, pid in pids.items():
         fields = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()
-        role = next((role for role in ("tmc", "learner") if name.endswith(role)), "uavs")  # with what forks them
-        spent[role] += (int(fields[11]) + int(fields[12])) / TICK
+        role = next((role for role in ("tmc", "learner") if name.endswith(role)), "uavs")  # each with its forkserver
+        spent[role] += (int(fields[11]) + int(fields[12])) / CLOCK_TICKS_PER_S
     return spent
 
 
 def _idle(out: Path, seconds: float) -> float | None:
-    """The mean idle share that the learner logged in the last `seconds`."""
+    """Return the mean idle share that the learner logged in the last `seconds`."""
     path = run_files(out).get("learner")
-    told = [decode(raw) for raw in Log(path).raw() if raw.topic == "/learner/metrics"] if path else []
-    shares = [metrics.idle_share for metrics in told if metrics.wall > told[-1].wall - seconds]
+    logged = [decode(raw) for raw in Log(path).raw() if raw.topic == "/learner/metrics"] if path else []
+    shares = [metrics.idle_share for metrics in logged if metrics.wall > logged[-1].wall - seconds]
     return sum(shares) / len(shares) if shares else None
 
 
 def compare(world: World, steps: int) -> Iterator[Row]:
-    """The gradient of each of so many updates against the textbook loop's, from minibatches of random flights."""
-    from learner import reference  # noqa: PLC0415  torch only for those who measure this
+    """Compare the gradients of `steps` updates with the textbook loop's, on minibatches of random flights."""
+    from learner import reference  # noqa: PLC0415  torch only for this bench
 
     replay = Replay(world, observation.ObservationBuilder(world))
     fill(replay)
@@ -196,13 +208,13 @@ def compare(world: World, steps: int) -> Iterator[Row]:
 
 
 def _batches(replay: Replay, count: int) -> Iterator[Batch]:
-    from learner.batching import BatchBuilder  # noqa: PLC0415
+    from learner.batching import BatchBuilder  # noqa: PLC0415  torch only for this bench
 
     builder, pace = BatchBuilder(replay.observer), bounds.Pace("--steps", count)
     for number in range(count):
         pace.check(number)
         if number % 200 == 199:
-            say(f"{number + 1:,} of {count:,} steps compared")
+            print_progress(f"{number + 1:,} of {count:,} steps compared")
         s = replay.sample(number, replay.world.config.dqn.batch_size)
         v = s.views
         yield builder.build(

@@ -1,6 +1,6 @@
-"""`overfly bench memory`: what all processes of a training use together, by role, and what the replay memory takes.
+"""`overfly bench memory`: memory of all processes of a training, by role, and of the replay memory.
 
-Memory is proportional (PSS): a page that several processes share counts once in all. This process is the supervisor.
+Memory is proportional (PSS): a page that several processes share counts once in total. This process is the supervisor.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.wire import process
 
-LIMIT = 600.0
-"""MB that is asked of three UAVs, the TMC, the learner and whoever starts them."""
-MB = 1024**2 / 1e6
-"""Of a MiB."""
+LIMIT_MB = 600.0
+"""Limit of three UAVs, the TMC, the learner and the processes that start them."""
+MB_PER_MIB = 1024**2 / 1e6
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
     parser.add_argument("--transitions", type=int, default=6000, metavar="T",
-                        help="in the replay memory when all are weighed (default: 6000)")  # fmt: skip
+                        help="transitions in the replay memory at the measurement (default: 6000)")  # fmt: skip
     settings.add_options(parser)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Train until so many transitions are in, weigh, and fill a replay memory; one row a figure."""
+    """Train until `--transitions` are stored, measure, then fill a replay memory; return one row per figure.
+
+    Raises ConfigError.
+    """
     values = {"training.episodes": 1_000_000, **settings.chosen(args)}  # it is stopped, not finished
     world = check(settings.config_for("paper", values))
     config = world.config
@@ -46,7 +48,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
     )
     if not least < args.transitions < most * config.team.size:
         raise ConfigError(
-            f"--transitions must be more than the {least:,} before the first update, and come to be flown"
+            f"--transitions must be more than the {least:,} before the first update, and fewer than the mission flies"
         )
     if args.transitions > config.replay.capacity:
         raise ConfigError(
@@ -59,9 +61,9 @@ def measure(args: argparse.Namespace) -> list[Row]:
 
 
 def in_training(world: World, transitions: int, out: Path) -> rollout.Memory | None:
-    """The memory of all processes once they have flown so many transitions and learn from them."""
+    """Return the memory of all processes once they have flown `transitions` and learn; None if not available."""
     with rollout.started(world.config, None, out) as (supervisor, observer):
-        told, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
+        shown_at, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
         while not supervisor.watch():
             time.sleep(rollout.POLL_S)
             status = observer.ask()
@@ -71,25 +73,26 @@ def in_training(world: World, transitions: int, out: Path) -> rollout.Memory | N
             if flown >= transitions and status.updates:
                 return rollout.weigh_all(supervisor.pids())
             pace.check(flown)
-            if time.monotonic() > told + 5.0:
-                told, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
+            if time.monotonic() > shown_at + 5.0:
+                shown_at, pace = time.monotonic(), bounds.Pace("--transitions", transitions)
                 process.tell(f"{flown:,} of {transitions:,} transitions", prefix="")
     return None
 
 
 def _rows(size: int, memory: rollout.Memory | None) -> Iterator[Row]:
-    total = memory.total * MB if memory else None
-    yield Row("memory", f"N={size}", total, "MB in all", LIMIT, total and total / LIMIT, "of what is asked")
-    for role, used in sorted(memory.roles.items()) if memory else ():
-        yield Row("memory", f"N={size} {role}", used * MB, "MB", total, total and used * MB / total, "of all")
+    total = memory.total * MB_PER_MIB if memory else None
+    yield Row("memory", f"N={size}", total, "MB in total", LIMIT_MB, total and total / LIMIT_MB, "of the limit")
+    for role, mib in sorted(memory.roles.items()) if memory else ():
+        used = mib * MB_PER_MIB
+        yield Row("memory", f"N={size} {role}", used, "MB", total, total and used / total, "of the total")
 
 
 def full_replay(world: World) -> Row:
-    """By how much this process grows when it fills a replay memory."""
+    """Measure by how much this process grows when it fills a replay memory."""
     before = rollout.own()
     memory = Replay(world, ObservationBuilder(world))
     replay.fill(memory)
     after, limit = rollout.own(), replay.LIMITS["memory"]
-    grown = None if before is None or after is None else (after - before) * MB
+    grown = None if before is None or after is None else (after - before) * MB_PER_MIB
     return Row("memory", f"replay, {len(memory):,} transitions", grown, "MB", limit,
-               grown and grown / limit, "of what is asked")  # fmt: skip
+               grown and grown / limit, "of the limit")  # fmt: skip

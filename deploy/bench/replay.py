@@ -1,9 +1,9 @@
-"""`overfly bench replay`: what the replay memory weighs, takes in and gives out, on one core, without processes.
+"""`overfly bench replay`: size, inserts and samples of the replay memory, on one core.
 
-It is filled with flights at random, an exchange at a time as the TMC fills it, until it holds `replay.capacity`
-transitions. A minibatch is drawn, and its images into memory that is used again, as TMC and learner do it between them.
-All is measured in a process with the TMC's environment, in which freed memory is kept. Times are the processor's, so a
-busy machine changes them less.
+It is filled with random flights, one exchange at a time as in the TMC, until it holds `replay.capacity` transitions.
+Then minibatches are sampled, and their images drawn into reused memory, as TMC and learner do together. All is measured
+in one process with the TMC's environment, in which freed memory is kept. Times are processor time, so that a busy
+machine changes them less.
 """
 
 from __future__ import annotations
@@ -35,48 +35,50 @@ from tmc.kernel.world import World
 from tmc.wire import process
 
 LIMITS = {"bytes": 100.0, "memory": 60.0, "minibatch": 1.5, "inserts": 100_000.0, "prioritised": 3.0}
-"""What is asked of 100,000 transitions of the paper: bytes each, MB in all, ms a minibatch, at least inserts/s, ms a
-minibatch that is drawn by priorities and then changes them."""
-ALPHA = 0.6
-"""The exponent of priorities where the settings have none (Schaul et al. 2016, Table 3; Horgan et al. 2018)."""
-MINIBATCH = 0.01
-"""Seconds that a minibatch is taken to need, with its share of what is kept of each until the end."""
-WARM = 5
+"""Limits for 100,000 transitions of the paper.
+
+`bytes`: per transition. `memory`: MB in total. `minibatch`: ms per minibatch. `inserts`: at least so many per second.
+`prioritised`: ms per minibatch that is sampled by priorities and then updates them.
+"""
+PRIORITY_EXPONENT = 0.6
+"""The exponent of priorities if the settings have 0 (Schaul et al. 2016, Table 3; Horgan et al. 2018)."""
+MINIBATCH_S = 0.01
+"""Assumed time (s) of a minibatch."""
+WARM_UP_MINIBATCHES = 5
 """Minibatches that are not timed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
-    parser.add_argument("--minibatches", type=int, default=500, metavar="M", help="drawn and timed (default: 500)")
+    parser.add_argument("--minibatches", type=int, default=500, metavar="M", help="minibatches to time (default: 500)")
     settings.add_options(parser)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Fill it, then draw from it, in a process of its own; one row a figure."""
-    bounds.number("--minibatches", args.minibatches, 1, MINIBATCH)
+    """Fill a replay memory and sample from it, in a separate process; return one row per figure. Raises ConfigError."""
+    bounds.number("--minibatches", args.minibatches, 1, MINIBATCH_S)
     world = check(settings.config_for("paper", settings.chosen(args)))
     bounds.memory(world)
     words = ("deploy.bench.replay", "--minibatches", args.minibatches)
-    told = json.dumps(flat(world.config))
-    printed = helper.output_of(helper.start(*words, env=plan.environment("tmc", 1)), told)
+    printed = helper.output_of(helper.start(*words, env=plan.environment("tmc", 1)), json.dumps(flat(world.config)))
     held, batch, found = (
         f"{world.config.replay.capacity:,} transitions",
         world.config.dqn.batch_size,
         json.loads(printed),
     )
     return [
-        _row(held, found["bytes"], "bytes each", "bytes"),
-        _row(f"{held} with priorities", found["bytes with priorities"], "bytes each", "bytes"),
+        _row(held, found["bytes"], "bytes/transition", "bytes"),
+        _row(f"{held} with priorities", found["bytes with priorities"], "bytes/transition", "bytes"),
         _row("process above an empty one", found["memory"], "MB", "memory"),
-        _row(f"a minibatch of {batch}", median(found["uniform"]), "ms", "minibatch"),
-        _row("the fastest of them", min(found["uniform"]), "ms", "minibatch"),
-        _row("prioritised, and its update", median(found["prioritised"]), "ms", "prioritised"),
+        _row(f"minibatch of {batch}", median(found["uniform"]), "ms", "minibatch"),
+        _row(f"minibatch of {batch}, fastest", min(found["uniform"]), "ms", "minibatch"),
+        _row("prioritised, with update", median(found["prioritised"]), "ms", "prioritised"),
         _row("inserts", found["inserts"], "transitions/s", "inserts"),
     ]
 
 
 def weigh(values: dict[str, Any], minibatches: int) -> dict[str, Any]:
-    """The figures: without priorities and with them. `memory`: None where the system does not tell."""
+    """Return the figures, without priorities and with them. `memory`: None if the system does not report it."""
     world = World(build({**values, "replay.priority_exponent": 0.0}))
     before = _resident()
     replay = Replay(world, ObservationBuilder(world))
@@ -84,34 +86,38 @@ def weigh(values: dict[str, Any], minibatches: int) -> dict[str, Any]:
     grown = None if before is None else (_resident() or before) - before
     found: dict[str, Any] = {"bytes": weight(replay), "memory": grown, "inserts": inserted / spent}
     found["uniform"] = drawn(replay, minibatches)
-    world = World(build({**values, "replay.priority_exponent": values["replay.priority_exponent"] or ALPHA}))
+    world = World(
+        build({**values, "replay.priority_exponent": values["replay.priority_exponent"] or PRIORITY_EXPONENT})
+    )
     replay = Replay(world, ObservationBuilder(world))
     fill(replay)
     return {**found, "bytes with priorities": weight(replay), "prioritised": drawn(replay, minibatches)}
 
 
 def weight(replay: Replay) -> float:
-    """Bytes a transition."""
+    """Return the bytes per transition."""
     arrays = sum(ring.data.nbytes for ring in vars(replay).values() if isinstance(ring, Ring))
     return (arrays + (replay.priorities.nbytes if replay.priorities else 0)) / len(replay)
 
 
 def drawn(replay: Replay, minibatches: int) -> list[float]:
-    """Milliseconds of the processor that each of so many minibatches takes."""
+    """Return the processor time (ms) of each minibatch."""
     batch, (channels, height, width) = replay.world.config.dqn.batch_size, replay.observer.shape
-    images = np.empty((2 * batch, height, width, channels), np.float32).transpose(0, 3, 1, 2)  # as the learner has them
+    images = np.empty((2 * batch, height, width, channels), np.float32).transpose(
+        0, 3, 1, 2
+    )  # channels last, as in the learner
     rng = np.random.Generator(np.random.Philox(0))
-    errors = (rng.exponential(size=batch).astype("f4") for _ in range(minibatches + WARM))
-    return [_drawn(replay, number, images, of) for number, of in enumerate(errors)][WARM:]
+    errors = (rng.exponential(size=batch).astype("f4") for _ in range(minibatches + WARM_UP_MINIBATCHES))
+    return [_drawn(replay, number, images, of) for number, of in enumerate(errors)][WARM_UP_MINIBATCHES:]
 
 
 def _row(case: str, value: float | None, unit: str, limit: str) -> Row:
-    asked = LIMITS[limit]
-    return Row("replay", case, value, unit, asked, value and value / asked, "of what is asked")
+    reference = LIMITS[limit]
+    return Row("replay", case, value, unit, reference, value and value / reference, "of the limit")
 
 
 def _resident() -> float | None:
-    """MB of memory that this process uses; None where the system does not tell."""
+    """Return the memory (MB) of this process; None if the system does not report it."""
     try:
         found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{os.getpid()}/status").read_text())
     except OSError:
@@ -120,7 +126,7 @@ def _resident() -> float | None:
 
 
 def _drawn(replay: Replay, number: int, images: Floats, errors: Floats) -> float:
-    """Milliseconds of the processor that minibatch `number` takes; `errors` (B,) are found in it afterwards."""
+    """Return the processor time (ms) of minibatch `number`; `errors` (B,): its TD errors, which set priorities."""
     start = time.process_time()
     sample = replay.sample(number, replay.world.config.dqn.batch_size)
     replay.observer.observe_batch(sample.views, images)
@@ -130,7 +136,7 @@ def _drawn(replay: Replay, number: int, images: Floats, errors: Floats) -> float
 
 
 def fill(replay: Replay) -> tuple[int, float]:
-    """Episodes of random moves until the memory is full: transitions put in, and the processor's seconds for that."""
+    """Insert random flights until the memory is full; return (transitions inserted, processor time in s)."""
     world, team = replay.world, replay.world.config.team.size
     full = world.config.replay.capacity // team * team
     inserted, spent, episode = 0, 0.0, 0
@@ -142,7 +148,7 @@ def fill(replay: Replay) -> tuple[int, float]:
             start = time.process_time()
             number = replay.add_frame(tick, frame)
             base = np.full(rows[0].shape, number if tick == 0 else number - 1, np.int64)
-            base[-1] = number  # what is known at the exchange's own tick is the new map
+            base[-1] = number  # at the exchange's own tick the UAVs have the new map
             replay.add_rows(episode, tick - len(base) + 1, *rows, base, [True] * len(base))
             spent += time.process_time() - start
             inserted += base.size
@@ -153,7 +159,7 @@ Rows = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32]]
 
 
 def _exchanges(world: World, episode: int) -> Iterator[tuple[int, Rows, NDArray[np.generic]]]:
-    """An episode as the TMC learns of it: (tick, its rows since the last exchange, the map with all visits by then)."""
+    """Yield the exchanges of a random episode: (tick, rows since the last exchange, map with all visits by then)."""
     T, T_u, N = world.config.training.ticks, world.config.T_u, world.config.team.size
     rng = np.random.Generator(np.random.Philox(episode))
     actions, rewards = rng.integers(0, N_ACTIONS, (T + 1, N)).astype("u1"), rng.random((T + 1, N), np.float32)
@@ -174,10 +180,10 @@ def _exchanges(world: World, episode: int) -> Iterator[tuple[int, Rows, NDArray[
 
 
 def main() -> int:
-    """The process that is measured: settings as JSON on stdin, figures as JSON on stdout."""
+    """Measure in this process: settings as JSON on stdin, figures as JSON on stdout."""
     parser = argparse.ArgumentParser("deploy.bench.replay", description=__doc__, allow_abbrev=False)
     parser.add_argument("--minibatches", type=int, required=True)
-    parser.add_argument("--parent", type=int, default=0, help="process to die with")
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
     a = parser.parse_args()
     process.become_child(a.parent)
     json.dump(weigh(json.load(sys.stdin), a.minibatches), sys.stdout)

@@ -1,6 +1,6 @@
-"""`overfly bench rollout`: N UAV processes against the lock-step fleet, in turns, so that both see the same machine.
+"""`overfly bench rollout`: N UAV processes against the lock-step fleet, in turns, so that the machine is the same.
 
-A rate is taken over the flight alone, from the log: UAV steps between the first tick that became final and the last.
+A rate covers the flight alone, by the log: the UAV steps between the first final tick and the last.
 """
 
 from __future__ import annotations
@@ -31,23 +31,26 @@ from deploy.run.supervisor import Supervisor
 from tmc.center.journal import Journal
 from tmc.kernel.config import Config, build, flat
 from tmc.kernel.world import World
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import RunFolder, run_files
 from tmc.wire import process
 
 TRANSPORTS = {"table": (True,), "beacons": (False,), "both": (True, False)}
 """Whether the UAVs share a table of tracks, for each value of `--transport`."""
 LIMITS = {"private": 35.0, "memory": 4096.0, "start": 15.0}
-"""What is asked of a team of 100: MiB of private memory a UAV, MiB in all, seconds until the first tick is flown."""
-MISSION = 0.5
-"""Seconds that a mission of processes takes at least."""
+"""Limits of a team of 100: MiB of private memory per UAV, MiB in total, s until the first tick is flown."""
+MISSION_S = 0.5
+"""Least time (s) of a mission of processes."""
 POLL_S = 0.05
-"""Seconds between two looks at the processes."""
+"""Interval (s) at which the processes are checked."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """MiB while flying: private to a UAV's process (the largest), and of all processes, shared pages counted once; the
-    latter by role too, all UAVs together.
+    """Memory (MiB) while flying.
+
+    `private`: private memory of the largest UAV process. `total`: of all processes, shared pages counted once.
+    `roles`: `total` by role, all UAVs together.
     """
 
     private: float
@@ -57,8 +60,11 @@ class Memory:
 
 @dataclass(frozen=True)
 class RunData:
-    """One mission: UAV steps a second; seconds from start to the first tick; the share of time that UAVs waited for
-    peers; beacons a UAV step."""
+    """One mission.
+
+    `rate`: UAV steps per second. `start`: s from the start to the first tick. `waits`: share of time that UAVs waited
+    for peers. `beacons`: beacons per UAV step.
+    """
 
     rate: float
     start: float
@@ -69,18 +75,22 @@ class RunData:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
-    parser.add_argument("--who", default="planner:greedy", help="policy file, run folder or planner (default: greedy)")
+    parser.add_argument(
+        "--who", default="planner:greedy", help="policy file, run folder or planner (default: %(default)s)"
+    )
     parser.add_argument("--actors", default="1,2,3,10,50,100", metavar="N[,N...]", help="default: %(default)s")
-    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
-    parser.add_argument("--transport", choices=TRANSPORTS, default="table", help="of positions (default: table)")
+    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="turns to take medians of (default: 3)")
+    parser.add_argument(
+        "--transport", choices=TRANSPORTS, default="table", help="how UAVs share their positions (default: table)"
+    )
     settings.add_options(parser, actors=False)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Fly all of it; one row a figure."""
+    """Fly all missions; return one row per figure. Raises ConfigError."""
     pilot = policy_spec.resolve(args.who)
     values = policy_spec.mission_values(pilot, settings.chosen(args))
-    bounds.number("--repeats", args.repeats, 1, MISSION)
+    bounds.number("--repeats", args.repeats, 1, MISSION_S)
     sizes = [n for n in team_sizes(args.actors) if n is not None]
     worlds = [check(build({**values, "team.size": n}), pilot.policy) for n in sizes]
     for world in worlds:
@@ -93,7 +103,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
 
 
 def _size(world: World, policy: bytes | None, args: argparse.Namespace, scratch: Path) -> list[Row]:
-    """All repeats of one team size: the fleet, then the processes over each transport, and again."""
+    """Fly one team size `--repeats` times: the fleet, then the processes over each transport; return the rows."""
     transports = TRANSPORTS[args.transport]
     fleet: list[RunData] = []
     teams: dict[bool, list[RunData]] = {table: [] for table in transports}
@@ -102,7 +112,8 @@ def _size(world: World, policy: bytes | None, args: argparse.Namespace, scratch:
         for table in transports:
             teams[table].append(fly_processes(world, policy, _folder(scratch), table=table, weigh=repeat == 0))
         last = ", ".join(f"{flown[-1].rate:,.0f}" for flown in teams.values())
-        _say(f"N = {world.config.team.size}: fleet {fleet[-1].rate:,.0f}, processes {last} UAV steps a second")
+        speeds = f"fleet {fleet[-1].rate:,.0f}, processes {last} UAV steps per second"
+        _print_progress(f"N = {world.config.team.size}: {speeds}")
     rates = [f.rate for f in fleet]
     rows = [Row("rollout", f"N={world.config.team.size} one process", median(rates), "UAV steps/s")]
     for table, flown in teams.items():
@@ -117,10 +128,10 @@ def _rows(config: Config, transport: str, flown: list[RunData], fleet: list[floa
     yield Row("rollout", case, median(rates), "UAV steps/s", median(fleet), ratio, "x one process")
     waits = [f.waits for f in flown if f.waits is not None]
     yield Row("rollout", f"{case} waits", median(waits) if waits else None, "share of time")
-    yield Row("rollout", f"{case} beacons", median(f.beacons for f in flown), "beacons/step")
+    yield Row("rollout", f"{case} beacons", median(f.beacons for f in flown), "beacons/UAV step")
     figures: dict[str, tuple[float | None, str]] = {
         "private": (memory.private if memory else None, "MiB, largest UAV"),
-        "memory": (memory.total if memory else None, "MiB in all"),
+        "memory": (memory.total if memory else None, "MiB in total"),
         "start": (median(f.start for f in flown), "s to the first tick"),
     }
     for name, (value, unit) in figures.items():
@@ -128,7 +139,7 @@ def _rows(config: Config, transport: str, flown: list[RunData], fleet: list[floa
         yield Row("rollout", f"{case} {name}", value, unit, limit, value and value / limit, "of the limit")
 
 
-def _say(text: str) -> None:
+def _print_progress(text: str) -> None:
     process.tell(text, prefix="")
 
 
@@ -137,7 +148,7 @@ def _folder(scratch: Path) -> Path:
 
 
 def fly_fleet(world: World, policy: bytes | None, out: Path) -> RunData:
-    """The reference: the same mission in this process, with the same journal."""
+    """Fly the mission in this process, with the same journal: the reference."""
     start = time.time_ns()
     journal = Journal(out, world, "bench")
     try:
@@ -148,7 +159,7 @@ def fly_fleet(world: World, policy: bytes | None, out: Path) -> RunData:
 
 
 def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool, weigh: bool) -> RunData:
-    """The mission in processes of its own; `weigh`: look at their memory once, half way."""
+    """Fly the mission in processes; `weigh`: measure their memory once, half way."""
     config, memory, start = world.config, None, time.time_ns()
     half = config.training.episodes * config.training.ticks // 2
     with started(config, policy, out, table=table) as (supervisor, observer):
@@ -165,13 +176,13 @@ def fly_processes(world: World, policy: bytes | None, out: Path, *, table: bool,
 def started(
     config: Config, policy: bytes | None, out: Path, *, table: bool = True
 ) -> Iterator[tuple[Supervisor, StatusPoller]]:
-    """The processes of a mission in `out`, and who asks how far they are; they are stopped with the block."""
-    (out / "config.json").write_text(json.dumps(flat(config)), "utf-8")
+    """Start the processes of a mission in `out`; yield supervisor and poller; stop all at the end of the block."""
+    RunFolder(out).config.write_text(json.dumps(flat(config)), "utf-8")
     file = None if policy is None else out / "flown.onnx"
     if file is not None and policy is not None:
         file.write_bytes(policy)
     mission = plan.make(config, out, policy=file, table=table)
-    supervisor = Supervisor(mission, out, config.training.threads, _say)
+    supervisor = Supervisor(mission, out, config.training.threads, _print_progress)
     observer = StatusPoller(mission.endpoint)
     try:
         supervisor.start()
@@ -183,7 +194,7 @@ def started(
 
 
 def weigh_all(pids: Mapping[str, int]) -> Memory | None:
-    """The memory of these processes and of this one; None where the system does not tell, or they are gone."""
+    """Return the memory of these processes and of this one; None if the system does not report it, or one has ended."""
     try:
         rolls = {name: _rollup(pid) for name, pid in {**pids, "supervisor": os.getpid()}.items()}
     except OSError:
@@ -199,7 +210,7 @@ def weigh_all(pids: Mapping[str, int]) -> Memory | None:
 
 
 def own() -> float | None:
-    """MiB of this process, shared pages in proportion; None where the system does not tell."""
+    """Return the PSS (MiB) of this process; None if the system does not report it."""
     try:
         return _rollup(os.getpid())["Pss"] / 1024
     except OSError:
@@ -207,21 +218,21 @@ def own() -> float | None:
 
 
 def _rollup(pid: int) -> dict[str, int]:
-    """KiB by kind, from /proc/PID/smaps_rollup."""
+    """Return the memory (KiB) by kind, from /proc/PID/smaps_rollup."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text("utf-8", "replace")
     return {name: int(size) for name, size in re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE)}
 
 
 def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -> RunData:
-    """What the log of a mission says; `start` in ns of the wall clock."""
+    """Read the figures of a mission from its log; `start`: ns of the wall clock."""
     files = run_files(out)
     times, beacons = [], 0
     for raw in Log(files["tmc"]).raw():
         if raw.topic == "/tmc/metrics":
             times.append((raw.log_time, decode(raw).elapsed))
         elif raw.topic == "/log":
-            said = re.search(r"\bBeacon ([0-9]+)", decode(raw).message)
-            beacons += int(said[1]) if said else 0
+            count = re.search(r"\bBeacon ([0-9]+)", decode(raw).message)
+            beacons += int(count[1]) if count else 0
     steps = config.team.size * config.training.ticks * config.training.episodes
     seconds = times[-1][1] - times[0][1]
     uavs = [path for name, path in files.items() if name.startswith("uav-")]
@@ -235,13 +246,13 @@ def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -
 
 
 def _waits(files: list[Path], begin: int) -> float | None:
-    """Mean over the UAVs of the time waited for peers, as a share of the flight so far, by each one's last status."""
+    """Return the mean share of time that UAVs waited for peers, by the last status of each; None without one."""
     shares = []
     for file in files:
         last: Any = None
         for raw in Log(file).raw():
             if raw.schema == "overfly.UavStatus":
                 last = raw
-        if last is not None and last.log_time - begin > 2e8:  # a status in the first instants says nothing
+        if last is not None and last.log_time - begin > 2e8:  # a status in the first moments means nothing
             shares.append(decode(last).waited / ((last.log_time - begin) / 1e9))
     return sum(shares) / len(shares) if shares else None

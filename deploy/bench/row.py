@@ -1,4 +1,4 @@
-"""A line of a bench's result, and the machine that it was measured on."""
+"""A row of a bench's result, and the machine that it was measured on."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Row:
-    """One figure: `ratio` is value / reference, or the median of such ratios taken in pairs; None where there is none.
+    """One figure. `ratio`: value / reference, or the median of such ratios taken in pairs; None without one.
 
-    `what` says in words what the reference is.
+    `what`: the reference, in words.
     """
 
     bench: str
@@ -28,17 +28,17 @@ class Row:
 
 
 def finite(x: Any) -> Any:
-    """None for a float that is not a number or not finite: JSON has no word for it, a table no use."""
+    """Return None for a float that is not finite, since JSON cannot hold it; otherwise `x`."""
     return None if isinstance(x, float) and not math.isfinite(x) else x
 
 
 def core_count() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, load and versions: what a figure means nothing without."""
+    """Return processor, cores, load and versions, which belong to every figure."""
     return {
         "platform": platform.platform(),
         "processor": _processor(),
@@ -50,7 +50,7 @@ def machine() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """The model's name, where Linux tells it."""
+    """Return the name of the processor's model if Linux gives it, otherwise of its architecture."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
     except OSError:
@@ -66,7 +66,7 @@ def _version(name: str) -> str | None:
 
 
 def text(rows: list[Row]) -> str:
-    """The table for a person."""
+    """Return the rows as a table of text."""
     lines = [f"{'case':<34} {'value':>12} {'unit':<22} {'reference':>12} {'ratio':>6}"]
     lines += [
         f"{r.case:<34} {_number(r.value):>12} {r.unit:<22} {_number(r.reference):>12} "

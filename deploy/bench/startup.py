@@ -1,8 +1,8 @@
-"""`overfly bench startup`: how long a user waits: for the first update of `overfly run quick`, for the first word of
-a UAV started by hand, for `--help`, and for what each role imports before it does anything.
+"""`overfly bench startup`: how long a user waits for a start.
 
-All are processes of their own, started as a user starts them. One start of each goes before and does not count, so the
-files that Python reads are in the system's memory: what is measured is a start, not the disk.
+It measures the first update of `overfly run quick`, the first message of a UAV started by hand, `--help`, and the
+imports of each role. Each is a separate process, started as a user starts it. One start of each comes before and does
+not count, so that Python's files are in the system's cache: the bench measures a start, not the disk.
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ from tmc.wire import messages, process, sockets
 from tmc.wire.codec import decode
 
 LIMITS = {"run": 5.0, "actor": 0.6}
-"""What is asked of a start with warm caches: seconds to the first update of three UAVs, and to a UAV's first word."""
+"""Limits (s) of a start with warm caches: to the first update of three UAVs, and to a UAV's first message."""
 ROLES = ("tmc", "actors", "learner")
 """The modules of the roles: `python -m ROLE` imports `ROLE.__main__` and what it needs."""
-TURN = 2.0
-"""Seconds that all starts of a turn take at least."""
-PATIENCE_S = 120.0
-"""Seconds after which a start has failed."""
+TURN_S = 2.0
+"""Least time (s) of all starts of a turn."""
+START_TIMEOUT_S = 120.0
+"""Time (s) after which a start has failed."""
 POLL_S = 0.05
-"""Seconds between two looks at the learner's log."""
+"""Interval (s) at which the learner's log is read."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
-    parser.add_argument("--repeats", type=int, default=5, metavar="R", help="medians of so many (default: 5)")
-    parser.add_argument("--warm", type=int, default=1, metavar="W", help="turns before that do not count (default: 1)")
+    parser.add_argument("--repeats", type=int, default=5, metavar="R", help="turns to take medians of (default: 5)")
+    parser.add_argument("--warm", type=int, default=1, metavar="W", help="warm-up turns that do not count (default: 1)")
     settings.add_options(parser)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """Every start in turns; one row a figure."""
-    bounds.number("--repeats", args.repeats, 1, TURN)
-    bounds.number("--warm", args.warm, 0, TURN)
+    """Time every start in turns; return one row per figure. Raises ConfigError, MissionFailed."""
+    bounds.number("--repeats", args.repeats, 1, TURN_S)
+    bounds.number("--warm", args.warm, 0, TURN_S)
     changes = [word for key, value in settings.chosen(args).items() for word in ("--set", f"{key}={value}")]
     size = check(settings.config_for("quick", settings.chosen(args))).config.team.size
     starts: dict[str, Callable[[Path], float]] = {
         "run": lambda out: first_update(out, changes),
-        "actor": first_word,
+        "actor": first_message,
         "python": lambda _: finished("-c", "pass"),
         "help": lambda _: finished("-m", "deploy.cli", "--help"),
         **{role: partial(imported, role) for role in ROLES},
@@ -72,51 +72,51 @@ def measure(args: argparse.Namespace) -> list[Row]:
             for name, start in starts.items():
                 seconds = start(Path(tempfile.mkdtemp(dir=scratch)))
                 taken[name] += [seconds] if repeat > 0 else []
-            _say(f"turn {repeat} of {args.repeats}" if repeat > 0 else "a turn that warms the caches")
+            _print_progress(f"turn {repeat} of {args.repeats}" if repeat > 0 else "warm-up turn")
     return list(_rows(size, taken))
 
 
 def _rows(size: int, taken: dict[str, list[float]]) -> Iterator[Row]:
     middle = {name: median(seconds) for name, seconds in taken.items()}
     for name, case in (("run", f"run quick, N={size}"), ("actor", "actor alone")):
-        limit, unit = LIMITS[name], "s to the first update" if name == "run" else "s to its first word"
-        yield Row("startup", case, middle[name], unit, limit, middle[name] / limit, "of what is asked")
+        limit, unit = LIMITS[name], "s to the first update" if name == "run" else "s to its first message"
+        yield Row("startup", case, middle[name], unit, limit, middle[name] / limit, "of the limit")
     for name in ("help", *ROLES):
         ratio = median(a / b for a, b in zip(taken[name], taken["python"], strict=True))
-        case, unit = ("--help", "s") if name == "help" else (f"import {name}", "s, the process as a whole")
+        case, unit = ("--help", "s") if name == "help" else (f"import {name}", "s, whole process")
         yield Row("startup", case, middle[name], unit, middle["python"], ratio, "x an empty Python")
 
 
-def _say(text: str) -> None:
+def _print_progress(text: str) -> None:
     process.tell(text, prefix="")
 
 
 def command(*words: object) -> list[str]:
-    """The command line of Python with our packages, whatever lies in the folder that it is started in."""
+    """Return a command line of Python that imports nothing from the current folder."""
     return [sys.executable, "-P", *map(str, words)]
 
 
 def environment() -> dict[str, str]:
-    """This process's, with the place of our packages."""
+    """Return this process's environment, with Overfly's packages on the path."""
     path = os.pathsep.join(p for p in (str(ROOT), os.environ.get("PYTHONPATH", "")) if p)
     return os.environ | {"PYTHONPATH": path}
 
 
 def imported(role: str, _: Path) -> float:
-    """Seconds of a process that imports what a role needs, and ends."""
+    """Return the time (s) of a process that imports what a role needs, and ends."""
     return finished("-c", f"import {role}.__main__")
 
 
 def finished(*words: str) -> float:
-    """Seconds from the start of a process to its end."""
+    """Return the time (s) from the start of a process to its end."""
     start = time.monotonic()
-    subprocess.run(command(*words), env=environment(), stdout=subprocess.DEVNULL, check=True, timeout=PATIENCE_S)
+    subprocess.run(command(*words), env=environment(), stdout=subprocess.DEVNULL, check=True, timeout=START_TIMEOUT_S)
     return time.monotonic() - start
 
 
 @contextmanager
 def running(*words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """`overfly WORDS`, ended in order with the block."""
+    """Run `overfly WORDS`; interrupt it at the end of the block."""
     line = command("-m", "deploy.cli", *words)
     with subprocess.Popen(line, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as started:
         try:
@@ -127,18 +127,23 @@ def running(*words: object) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def first_update(out: Path, changes: list[str]) -> float:
-    """Seconds from the start of `overfly run quick` to its first update, whose time is in the learner's log."""
+    """Return the time (s) from the start of `overfly run quick` to its first update, by the learner's log.
+
+    Raises MissionFailed.
+    """
     start = time.monotonic()
     with running("run", "quick", *changes, "--out", out) as run:
         while (at := _first_update(out / "learner.mcap.active")) is None:
-            if run.poll() is not None or time.monotonic() - start > PATIENCE_S:
-                raise MissionFailed(f"overfly run quick made no update in {PATIENCE_S:g} s")
+            if run.poll() is not None or time.monotonic() - start > START_TIMEOUT_S:
+                raise MissionFailed(f"overfly run quick made no update in {START_TIMEOUT_S:g} s")
             time.sleep(POLL_S)
-        return time.monotonic() - (time.time_ns() - at) / 1e9 - start  # of the wall clock only the last moments count
+        return (
+            time.monotonic() - (time.time_ns() - at) / 1e9 - start
+        )  # the wall clock is used for the last moments only
 
 
 def _first_update(log: Path) -> int | None:
-    """When the learner wrote its first metrics, in ns of the wall clock: it does so after its first update."""
+    """Return when (ns, wall clock) the learner logged its first metrics, after its first update; None: not yet."""
     try:
         first = next((raw for raw in reader.Log(log).raw() if raw.topic == "/learner/metrics"), None)
     except RecordError:  # not there yet, or still empty
@@ -149,16 +154,16 @@ def _first_update(log: Path) -> int | None:
     return first.log_time
 
 
-def first_word(out: Path) -> float:
-    """Seconds from the start of `overfly actor` to its Hello at a TMC, which is this process here."""
+def first_message(out: Path) -> float:
+    """Return the time (s) from the start of `overfly actor` to its Hello at this process. Raises MissionFailed."""
     endpoint = f"tcp://127.0.0.1:{sockets.free_port()}"  # the name of a folder may be too long for a socket
     context: zmq.Context[Any] = zmq.Context()
     try:
         tmc = sockets.router(context, endpoint)
         start = time.monotonic()
         with running("actor", "--id", 0, "--connect", endpoint, "--out", out / "U"):
-            if not tmc.poll(int(PATIENCE_S * 1000)):
-                raise MissionFailed(f"a UAV said nothing for {PATIENCE_S:g} s")
+            if not tmc.poll(int(START_TIMEOUT_S * 1000)):
+                raise MissionFailed(f"a UAV sent nothing for {START_TIMEOUT_S:g} s")
             seconds = time.monotonic() - start
             frames = sockets.receive(tmc) or []
     finally:

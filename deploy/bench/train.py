@@ -1,7 +1,7 @@
-"""`overfly bench train`: ticks a second of the whole recipe, one minibatch a tick, against the textbook compute loop;
-how long a start takes, and what memory all processes use together.
+"""`overfly bench train`: ticks per second of the whole training, one minibatch per tick, against the textbook loop.
 
-The missions are those of `overfly bench learner`, which says why they stand for the paper's.
+It also measures the start, and the memory of all processes together. The missions are those of `overfly bench learner`,
+which explains why they represent the paper's.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from deploy.run.mission import check
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the bench."""
     parser.add_argument("--actors", default="3,10", metavar="N[,N...]", help="default: %(default)s")
-    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="medians of so many (default: 3)")
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each stretch (default: 10)")
-    parser.add_argument("--threads", type=int, default=2, metavar="N", help="of the learner and the loop (default: 2)")
+    parser.add_argument("--repeats", type=int, default=3, metavar="R", help="turns to take medians of (default: 3)")
+    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="length of each stretch (default: 10)")
+    parser.add_argument(
+        "--threads", type=int, default=2, metavar="N", help="threads of the learner and of the loop (default: 2)"
+    )
     settings.add_options(parser, actors=False)
 
 
 def measure(args: argparse.Namespace) -> list[Row]:
-    """ReferenceLearner loop and missions of each size in turns; one row a figure."""
+    """Run the textbook loop and missions of each size in turns; return one row per figure. Raises ConfigError."""
     values = {**learner.MISSION, "training.threads": args.threads, **settings.chosen(args)}
     sizes = [n for n in team_sizes(args.actors) if n is not None]
     bounds.stretches(args.repeats, args.seconds, 1 + len(sizes))
@@ -43,12 +45,12 @@ def measure(args: argparse.Namespace) -> list[Row]:
             for world, runs in zip(worlds, flown, strict=True):
                 runs.append(learner.fly(world, args.seconds, Path(tempfile.mkdtemp(dir=scratch))))
             rates = ", ".join(f"N={n} {runs[-1].ticks:.1f}" for n, runs in zip(sizes, flown, strict=True))
-            learner.say(f"textbook loop {textbook[-1]:.1f} updates/s, ticks/s: {rates}")
+            learner.print_progress(f"textbook loop {textbook[-1]:.1f} updates/s, ticks/s: {rates}")
     return [row for n, runs in zip(sizes, flown, strict=True) for row in _rows(n, runs, textbook)]
 
 
 def _rows(size: int, runs: list[learner.Learned], textbook: list[float]) -> list[Row]:
-    """The figures of one team size."""
+    """Return the figures of one team size."""
     ratio = median(run.ticks / loop for run, loop in zip(runs, textbook, strict=True))
     memory = [run.memory for run in runs if run.memory is not None]
     return [
@@ -63,5 +65,5 @@ def _rows(size: int, runs: list[learner.Learned], textbook: list[float]) -> list
         ),
         *learner.shares("train", f"N={size}", runs),
         Row("train", f"N={size} start", median(run.start for run in runs), "s to the first update"),
-        Row("train", f"N={size} memory", median(memory) if memory else None, "MiB in all"),
+        Row("train", f"N={size} memory", median(memory) if memory else None, "MiB in total"),
     ]

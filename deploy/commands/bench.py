@@ -1,4 +1,4 @@
-"""`overfly bench NAME`: measure this machine; each figure beside its reference of the same run."""
+"""`overfly bench NAME`: measures this machine; each figure stands beside a reference of the same run."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from tmc.wire.process import FAILED, tell
 
 @dataclass(frozen=True)
 class Bench:
-    """One row: its name, the module with `add_arguments(parser)` and `measure(args) -> list[Row]`, one line of help,
-    and the extras that it needs."""
+    """One bench: its name, its module, its line of help, and the extras that it needs.
+
+    The module has `add_arguments(parser)` and `measure(args) -> list[Row]`.
+    """
 
     name: str
     module: str
@@ -31,18 +33,18 @@ class Bench:
 
 WITH_LEARNER = (extras.LEARNER,)
 BENCHES: tuple[Bench, ...] = (
-    Bench("rollout", "deploy.bench.rollout", "UAV steps a second of N processes against the fleet in one process"),
-    Bench("journal", "deploy.bench.journal", "what the TMC's journal takes, a commit costs, and a UAV step leaves"),
-    Bench("learner", "deploy.bench.learner", "updates a second of a running mission against the textbook loop",
+    Bench("rollout", "deploy.bench.rollout", "UAV steps per second of N processes against the fleet in one process"),
+    Bench("journal", "deploy.bench.journal", "rate of the TMC's journal, cost of a commit, bytes per UAV step"),
+    Bench("learner", "deploy.bench.learner", "updates per second of a running mission against the textbook loop",
           WITH_LEARNER),
-    Bench("startup", "deploy.bench.startup", "seconds to the first update, to a UAV's first word, and of imports",
+    Bench("startup", "deploy.bench.startup", "seconds to the first update, to a UAV's first message, and of imports",
           WITH_LEARNER),
     Bench("memory", "deploy.bench.memory", "memory of all processes of a training, by role, and of the replay memory",
           WITH_LEARNER),
-    Bench("train", "deploy.bench.train", "ticks a second of the whole recipe, start and memory, for some team sizes",
+    Bench("train", "deploy.bench.train", "ticks per second of the whole training, start and memory, by team size",
           WITH_LEARNER),
-    Bench("replay", "deploy.bench.replay", "bytes a transition, milliseconds a minibatch, inserts a second"),
-    Bench("actor", "deploy.bench.actor", "a whole UAV step against the bare call of ONNX Runtime", WITH_LEARNER),
+    Bench("replay", "deploy.bench.replay", "bytes per transition, milliseconds per minibatch, inserts per second"),
+    Bench("actor", "deploy.bench.actor", "a whole UAV step against a textbook call of ONNX Runtime", WITH_LEARNER),
 )  # fmt: skip
 
 
@@ -51,12 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     names = parser.add_subparsers(dest="bench", required=True, metavar="NAME")
     for bench in BENCHES:
         sub = names.add_parser(bench.name, help=bench.about, description=bench.about)
-        sub.add_argument("--json", action="store_true", help="print one line of JSON a figure")
+        sub.add_argument("--json", action="store_true", help="print one line of JSON per figure")
         importlib.import_module(bench.module).add_arguments(sub)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Measure, then print the table, or a line of JSON a figure with the machine and the versions."""
+    """Measure, then print the table, or one line of JSON per figure with the machine; return the exit code."""
     bench = next(bench for bench in BENCHES if bench.name == args.bench)
     extras.require(*bench.needs)
     facts = machine()
@@ -66,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
     except MissionFailed as failed:
         tell(str(failed))
         return FAILED
-    except subprocess.CalledProcessError as failed:  # what it had to say stands above
+    except subprocess.CalledProcessError as failed:  # its own output is above
         code = failed.returncode
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         process.tell(f"a process that was measured {how}")

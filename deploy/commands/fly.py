@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from deploy import extras, policy_spec, settings
+import overfly
+from deploy import policy_spec, settings
 from deploy.commands.analyze import report
 from deploy.commands.run import add_mission_options
-from deploy.run import mission, plan
-from tmc.kernel.config import build
+from deploy.run import mission
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,13 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Fly, then say how it went. One episode unless --episodes says otherwise; the paper's settings otherwise."""
-    extras.require()
-    pilot = policy_spec.resolve(args.who)
-    values = policy_spec.mission_values(pilot, settings.chosen(args))
-    world = mission.check(build(values), pilot.policy, pilot.name)
-    if not args.lockstep:
-        plan.check_machine(world.config, learns=False, out=args.out)
-    out = mission.new_folder(args.out, "fly")
-    flight = mission.Mission(world, out, mission.command_line(), pilot.policy, flies=pilot.name)
-    code = flight.run(in_one_process=args.lockstep)
-    return code or report(out, as_json=args.json, pictures=not args.no_pictures)
+    changes, typed = settings.chosen(args), mission.command_line()
+    run = overfly.fly(args.who, out=args.out, lockstep=args.lockstep, settings=changes, _command=typed)
+    return report(run.folder, as_json=args.json, pictures=not args.no_pictures)

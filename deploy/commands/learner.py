@@ -1,4 +1,4 @@
-"""`overfly learner`: the learner alone."""
+"""`overfly learner`: runs the learner."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from tmc.wire import process
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command."""
+    """Add the options of the command."""
     parser.add_argument("--connect", default="tcp://127.0.0.1:5555", metavar="ENDPOINT", help="the TMC's endpoint")
     parser.add_argument("--out", type=Path, default=Path("runs/learner"), metavar="DIR",
                         help="folder for its log, checkpoints and policies")  # fmt: skip
 
 
 def main(args: argparse.Namespace) -> int:
-    """Learn until the TMC ends the mission."""
+    """Learn until the TMC ends the mission; return the exit code. Raises ConfigError."""
     extras.require(extras.LEARNER)
-    from learner.__main__ import MISTAKES, learn  # noqa: PLC0415  torch is imported only when a learner is meant
+    from learner.__main__ import MISTAKES, learn  # noqa: PLC0415  torch only where there is a learner
 
     return process.run(lambda: learn(args.connect, args.out), MISTAKES)

@@ -1,4 +1,4 @@
-"""`overfly log ...`: what the log of a run holds, as text and CSV."""
+"""`overfly log ...`: prints the contents of a run's log, as text and CSV."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from pathlib import Path
 
 from deploy.commands import log_check, log_export
 from tmc.kernel.text import printable
-from tmc.record import facts
+from tmc.record import queries
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, info, logs_in, run_files
+from tmc.record.reader import Log, info
+from tmc.record.run_folder import logs_in, run_files
 from tmc.wire.process import DONE, FAILED, tell
 
 JOURNAL_VIEWS = ("moves", "uncertainty", "events", "digest")
 VIEWS = ("info", "cat", "moves", "uncertainty", "events", "digest")
 MORE = (log_check, log_export)
-"""Modules with views of their own."""
+"""Modules that add their own views."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command."""
+    """Add the options of the command."""
     views = parser.add_subparsers(dest="view", required=True, metavar="VIEW")
     about = {
         "info": "files, topics and counts",
-        "cat": "every message as a line of JSON",
+        "cat": "every message, one line of JSON per message",
         "moves": "CSV tick,uav,cell; tick 0 is the start",
         "uncertainty": "CSV tick,value: the sum over cells of the true map",
         "events": "CSV tick,cell: events that appeared (scenario I)",
-        "digest": "the hash of all trajectories, the last word printed",
+        "digest": "the hash of all trajectories, printed as the last word",
     }
     for view in VIEWS:
         sub = views.add_parser(view, help=about[view], description=about[view])
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         if view in {"moves", "uncertainty", "events"}:
             sub.add_argument("--episode", type=int, default=1, metavar="E", help="from 1 (default: 1)")
         if view == "info":
-            sub.add_argument("--json", action="store_true", help="print it as JSON")
+            sub.add_argument("--json", action="store_true", help="print JSON")
         if view == "cat":
             sub.add_argument("--topic", action="append", metavar="TOPIC", help="only this topic; may be repeated")
     for module in MORE:
@@ -50,9 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print one view; exit code 1 when the log that it is made from is damaged, for then it is not all there.
+    """Print one view; return exit code 1 if its log is damaged, since the view is then incomplete.
 
-    `info` says so too, but has done what was asked.
+    `info` reports damage too, but returns 0. Raises RecordError.
     """
     damage = _damage(args.run) if args.view in JOURNAL_VIEWS else None
     try:
@@ -60,12 +61,12 @@ def main(args: argparse.Namespace) -> int:
     except RecordError as error:
         raise RecordError(f"{error} ({damage})" if damage else str(error)) from None
     if damage:
-        tell(f"this is not all of it: {damage}")
+        tell(f"the output is incomplete: {damage}")
     return 1 if damage else code
 
 
 def _damage(run: Path) -> str | None:
-    """What is wrong with the TMC's journal; a journal that still grows is not damaged."""
+    """Return how the TMC's journal is damaged, None if it is not; a journal that still grows is not damaged."""
     path = run_files(run).get("tmc")
     if path is None:
         return None
@@ -107,7 +108,7 @@ def _cat(args: argparse.Namespace) -> int:
             print(json.dumps(head | {"message": body}))
         damage += [log.damage] if log.damage and not log.still_open else []
     for text in damage:
-        tell(f"this is not all of it: {text}")
+        tell(f"the output is incomplete: {text}")
     if wanted and not damage:
         raise RecordError(
             f"{args.run} holds nothing on {', '.join(sorted(wanted))}: `overfly log info` lists its topics"
@@ -122,18 +123,18 @@ def _csv(header: str, rows: Iterable[tuple[object, ...]]) -> int:
 
 
 def _digest(args: argparse.Namespace) -> int:
-    episodes = facts.tracks(args.run)
+    episodes = queries.tracks(args.run)
     if not episodes:
         raise RecordError(f"{args.run} holds no flight record: nothing was flown")
-    print(f"{len(episodes)} episode(s) {facts.digest(args.run)}")
+    print(f"{len(episodes)} episode(s) {queries.digest(args.run)}")
     return 0
 
 
 _MAINS: dict[str, Callable[[argparse.Namespace], int]] = {
     "info": _info,
     "cat": _cat,
-    "moves": lambda a: _csv("tick,uav,cell", facts.moves(a.run, a.episode)),
-    "uncertainty": lambda a: _csv("tick,value", facts.uncertainty(a.run, a.episode)),
-    "events": lambda a: _csv("tick,cell", facts.events(a.run, a.episode)),
+    "moves": lambda a: _csv("tick,uav,cell", queries.moves(a.run, a.episode)),
+    "uncertainty": lambda a: _csv("tick,value", queries.uncertainty(a.run, a.episode)),
+    "events": lambda a: _csv("tick,cell", queries.events(a.run, a.episode)),
     "digest": _digest,
 } | {view: main for module in MORE for view, main in module.MAINS.items()}

@@ -1,4 +1,4 @@
-"""`overfly log check | recover | compact`: is a log true, what of it can be saved, and how it is kept."""
+"""`overfly log check | recover | compact`: checks, repairs and compacts the logs of a run."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from tmc.kernel.text import printable
 from tmc.record.errors import NoLogError, RecordError
 from tmc.record.mcap.compact import compact_run
 from tmc.record.mcap.recover import Recovery, recover
-from tmc.record.reader import logs_in
+from tmc.record.run_folder import logs_in
 from tmc.wire.process import DONE, FAILED, USAGE, tell
 
-PATIENCE_S = 2.0
-"""Time before the first word of progress."""
+PROGRESS_DELAY_S = 2.0
+"""Time (s) before the first line of progress."""
 LOSS = 3
-"""Exit code: done, but something is lost."""
+"""Exit code: done, but data are lost."""
 ABOUT = {
     "check": "replay the TMC's journal and check every invariant of a flight",
-    "recover": "make intact, finished files of what is cut or damaged",
+    "recover": "make intact, finished files of cut or damaged ones",
     "compact": "rewrite a run's logs for keeping: large chunks, finished names",
 }
 
 
 def add_options(view: str, parser: argparse.ArgumentParser) -> None:
-    """Options of one view."""
+    """Add the options of one view."""
     if view == "recover":
         parser.add_argument("run", type=Path, metavar="RUN", help="run folder, or one MCAP file")
         where = parser.add_mutually_exclusive_group()
-        where.add_argument("--out", type=Path, metavar="FILE", help="of one file (default: X.recovered.mcap)")
-        where.add_argument("--in-place", action="store_true", help="put the intact file in the place of the other")
+        where.add_argument("--out", type=Path, metavar="FILE", help="output, for one file (default: X.recovered.mcap)")
+        where.add_argument("--in-place", action="store_true", help="replace the file by the intact one")
         return
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
 
 
 def _check(args: argparse.Namespace) -> int:
     start = time.monotonic()
-    with Line(delay=PATIENCE_S) as line:
+    with Line(delay=PROGRESS_DELAY_S) as line:
         result = check.check(args.run, line.share)
     print("\n".join(map(printable, result.table())))
     print(f"\n{printable(result.summary())} in {time.monotonic() - start:.1f} s")
@@ -61,7 +61,7 @@ def _recover(args: argparse.Namespace) -> int:
 
 def _recover_one(path: Path, args: argparse.Namespace) -> int:
     try:
-        with Line(delay=PATIENCE_S) as line:
+        with Line(delay=PROGRESS_DELAY_S) as line:
             result: Recovery = recover(path, args.out, in_place=args.in_place, show=line.share)
     except RecordError as error:
         return _failed(error)
@@ -70,14 +70,14 @@ def _recover_one(path: Path, args: argparse.Namespace) -> int:
 
 
 def _failed(error: RecordError) -> int:
-    """Say it; what is not a log at all is a mistake in the command, as everywhere."""
+    """Print the error; return its exit code: a file that is not a log is a mistake in the command."""
     tell(str(error))
     return USAGE if isinstance(error, NoLogError) else FAILED
 
 
 def _compact(args: argparse.Namespace) -> int:
     try:
-        with Line(delay=PATIENCE_S) as line:
+        with Line(delay=PROGRESS_DELAY_S) as line:
             compacted = compact_run(args.run, line.share)
     except RecordError as error:
         return _failed(error)

@@ -1,4 +1,4 @@
-"""`overfly log merge | replay`: files made from a run's logs, for viewers."""
+"""`overfly log merge | replay`: makes files for viewers from a run's logs."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from tmc.analysis.viewer import replay_file
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.merge import merge
-from tmc.record.reader import logs_in
+from tmc.record.run_folder import logs_in
 from tmc.wire.process import DONE, FAILED, tell
 
 ABOUT = {
     "merge": "one MCAP file of all logs of a run, in order of time",
     "replay": "an episode as a file for viewers, on the simulated clock, with a layout",
 }
-PATIENCE = 2.0
-"""Seconds before the first word of progress."""
+PROGRESS_DELAY_S = 2.0
+"""Time (s) before the first line of progress."""
 
 
 def add_options(view: str, parser: argparse.ArgumentParser) -> None:
-    """Options of one view."""
+    """Add the options of one view."""
     if view == "merge":
         parser.add_argument("run", type=Path, help="run folder, or one MCAP file")
-        parser.add_argument("--prefix", default="", metavar="P/", help="put before each topic, to tell two runs apart")
+        parser.add_argument("--prefix", default="", metavar="P/", help="prefix of each topic, to distinguish two runs")
         parser.add_argument("--out", type=Path, metavar="FILE", help="(default: RUN/merged.mcap)")
         return
     parser.add_argument("run", type=Path, help="run folder")
@@ -38,12 +38,12 @@ def add_options(view: str, parser: argparse.ArgumentParser) -> None:
 def _merge(args: argparse.Namespace) -> int:
     files = logs_in(args.run)
     out = fresh(args.out) or next(iter(files.values())).parent / "merged.mcap"
-    with Line(delay=PATIENCE) as line:
-        merged = merge(files, out, args.prefix, lambda done, of: line.say(f"message {done:,} of {of:,}"))
+    with Line(delay=PROGRESS_DELAY_S) as line:
+        merged = merge(files, out, args.prefix, lambda done, of: line.show(f"message {done:,} of {of:,}"))
     for path in merged.open:
-        tell(f"{path} is not closed: what is in it so far was merged")
+        tell(f"{path} is still open: its messages so far were merged")
     for damage in merged.damage:
-        tell(f"this is not all of it: {damage}")
+        tell(f"the output is incomplete: {damage}")
     files_in = f"{merged.files} file" + "s" * (merged.files > 1)
     print(printable(f"{merged.path}: {merged.messages:,} messages of {files_in}, {_size(merged.path)}"))
     return FAILED if merged.damage else DONE
@@ -51,13 +51,13 @@ def _merge(args: argparse.Namespace) -> int:
 
 def _replay(args: argparse.Namespace) -> int:
     out = fresh(args.out) or replay_file.default_path(args.run, args.episode)
-    with Line(delay=PATIENCE) as line:
-        made = replay_file.write(args.run, args.episode, out, line.say)
-    flown = made.flown
+    with Line(delay=PROGRESS_DELAY_S) as line:
+        made = replay_file.write(args.run, args.episode, out, line.show)
+    flown = made.timeline
     for note in flown.notes:
         tell(note)
     if flown.damage:
-        tell(f"this is not all of it: {flown.damage}")
+        tell(f"the output is incomplete: {flown.damage}")
     elif not flown.whole:
         tell(f"episode {args.episode} was not flown to its end")
     print(printable(f"{made.path}: episode {args.episode}, ticks 0 to {flown.ticks:,}, {_size(made.path)}"))
@@ -66,7 +66,7 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def fresh(out: Path | None) -> Path | None:
-    """The file that the user named, if any; RecordError rather than write over one."""
+    """Return the file that the user named, if any. Raises RecordError if it exists."""
     if out is not None and os.path.lexists(out):
         raise RecordError(f"{out} exists already: choose another --out, or remove it")
     return out

@@ -1,4 +1,4 @@
-"""`overfly map ...`: the maps, as text, as a picture, as CSV, and whether they are in order."""
+"""`overfly map ...`: lists, shows, exports and checks maps."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ DEFAULT = "downtown-toronto"
 ABOUT = {
     "list": "the maps that come with Overfly, and what their presets count",
     "show": "draw a map as text that --map takes, and as a picture with --out",
-    "export": "the grid as CSV, a line a row from the north: 0 free, 1 road, 2 blocked; --map takes it",
-    "check": "what to look at before flying a map; exit code 1 when there is something",
+    "export": "the grid as CSV, one line per row from the north: 0 free, 1 road, 2 blocked; --map takes it",
+    "check": "what to check before flying a map; exit code 1 if there are findings",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command."""
+    """Add the options of the command."""
     views = parser.add_subparsers(dest="view", required=True, metavar="VIEW")
     for view, about in ABOUT.items():
         sub = views.add_parser(view, help=about, description=about)
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print one view."""
+    """Print one view; return the exit code. Raises MapError."""
     if args.view == "list":
         return _list()
     return _VIEWS[args.view](load_map(args.name, args.roads, args.obstacles), args)
@@ -59,7 +59,7 @@ def _list() -> int:
 def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
     out: Path | None = args.out
     if out is not None and out.suffix.lower() != ".png":
-        raise MapError(f"--out {out} is no PNG: give a name that ends in .png")
+        raise MapError(f"--out {out} is not a PNG: give a name that ends in .png")
     if out is not None and out.exists():
         raise MapError(f"{out} exists already: choose another --out, or remove it")
     if out is not None and (why := extras.lacking(extras.FIGURES)):
@@ -72,7 +72,7 @@ def _show(road_map: RoadMap, args: argparse.Namespace) -> int:
 
 
 def drawing(road_map: RoadMap) -> str:
-    """The map as text that `--map` takes, street-north on top, then the legend; square where lines are short enough."""
+    """Return the map as text that `--map` takes, street-north on top, then the legend; square if lines are short."""
     m, total = road_map, road_map.grid.size
     rows = m.text().splitlines()
     wide = [" ".join(row) for row in rows] if m.grid.cols <= 40 else rows

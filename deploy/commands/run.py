@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from deploy import extras, settings
+import overfly
+from deploy import settings
 from deploy.commands.analyze import report
-from deploy.run import mission, plan
+from deploy.run import mission
 from tmc.kernel.config import ConfigError
 from tmc.wire import process
 
@@ -34,15 +35,9 @@ def main(args: argparse.Namespace) -> int:
         return resume(args)
     if args.preset is None:
         raise ConfigError(f"which preset? choose {', '.join(settings.preset_names())}, or --resume RUN")
-    config = settings.config_for(args.preset, settings.chosen(args))
-    extras.require(*mission.needs(config, None))
-    world = mission.check(config)
-    mission.check_training(config)
-    if not args.lockstep:
-        plan.check_machine(config, learns=True, out=args.out)
-    out = mission.new_folder(args.out, args.preset)
-    code = mission.Mission(world, out, mission.command_line()).run(in_one_process=args.lockstep)
-    return code or report(out, as_json=args.json, pictures=not args.no_pictures)
+    changes, typed = settings.chosen(args), mission.command_line()
+    run = overfly.train(args.preset, out=args.out, lockstep=args.lockstep, settings=changes, _command=typed)
+    return report(run.folder, as_json=args.json, pictures=not args.no_pictures)
 
 
 def resume(args: argparse.Namespace) -> int:
@@ -51,11 +46,8 @@ def resume(args: argparse.Namespace) -> int:
         raise ConfigError(
             "--resume goes on with its own settings, as processes: give it nothing but --json, --no-pictures"
         )
-    if mission.finished(args.resume):
-        mission.require_settings(args.resume)
+    over = mission.finished(args.resume)
+    run = overfly.resume(args.resume, _command=mission.command_line())
+    if over:
         process.tell(f"{args.resume} was flown to its end: this is its summary")
-        return report(args.resume, as_json=args.json, pictures=not args.no_pictures)
-    world, policy = mission.interrupted(args.resume)
-    extras.require(*mission.needs(world.config, policy))
-    code = mission.Mission(world, args.resume, mission.command_line(), policy).run(in_one_process=False)
-    return code or report(args.resume, as_json=args.json, pictures=not args.no_pictures)
+    return report(run.folder, as_json=args.json, pictures=not args.no_pictures)

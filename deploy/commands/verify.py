@@ -1,4 +1,4 @@
-"""`overfly verify`: that processes fly what one process flies, wait only where they must, and survive being killed."""
+"""`overfly verify`: checks that processes fly what lock step flies, wait only where needed, and survive kills."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PHASES = ("together", "staggered")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command."""
+    """Add the options of the command."""
     kinds = parser.add_subparsers(dest="check", required=True, metavar="CHECK")
     about = "fly missions as processes and in lock step, and compare every fact of their logs"
     exact = kinds.add_parser("exactness", help=about, description=about)
@@ -39,35 +39,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     exact.add_argument("--ticks", metavar="T", help=ticks)
     exact.add_argument("--map", metavar="NAME", help=world)
     _add_common(exact)
-    about = "hold one UAV back, and see how far the others run ahead of it, and what bounds them"
+    about = "delay one UAV, and show how far the others run ahead of it, and what bounds them"
     asynchronous = kinds.add_parser("asynchrony", help=about, description=about)
     asynchronous.add_argument("--actors", type=int, default=3, metavar="N", help="default: %(default)s")
-    asynchronous.add_argument("--hold", type=float, default=0.1, metavar="S", help="seconds a tick (default: 0.1)")
+    asynchronous.add_argument(
+        "--hold", type=float, default=0.1, metavar="S", help="delay in seconds per tick (default: 0.1)"
+    )
     _add_common(asynchronous)
     about = verify_chaos.ABOUT
     verify_chaos.add_options(kinds.add_parser("chaos", help=about, description=about))
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--who", default="planner:greedy", help="who flies: policy file, run folder, or a planner")
+    parser.add_argument("--who", default="planner:greedy", help="what flies: policy file, run folder, or planner")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="changes", help="any setting")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the logs of missions that differ")
-    parser.add_argument("--json", action="store_true", help="print one line of JSON a row")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON per row")
 
 
 def main(args: argparse.Namespace) -> int:
-    """Verify; exit code 1 when something is not as it should be."""
+    """Verify; return exit code 1 if a check fails. Raises ConfigError."""
     extras.require()
     try:
         return MAINS[args.check](args)
-    except exactness.Stopped as stopped:
-        process.tell(str(stopped))
+    except exactness.MissionAborted as aborted:
+        process.tell(str(aborted))
         return process.FAILED
 
 
 @contextmanager
 def _workplace(out: Path | None) -> Iterator[Path]:
-    """A folder for logs: `out`, or a temporary one. It is removed unless something was left in it."""
+    """Yield a folder for logs: `out`, or a temporary one. It is removed if it is empty at the end."""
     folder = Path(tempfile.mkdtemp(prefix="overfly-verify-")) if out is None else new_folder(out, "verify")
     try:
         yield folder
@@ -77,16 +79,16 @@ def _workplace(out: Path | None) -> Iterator[Path]:
 
 
 def listed(option: str, text: str, choices: tuple[str, ...] = ()) -> list[str]:
-    """The items of `1,3,10`; ConfigError for one that is no number, or none of the choices."""
+    """Return the items of a list such as `1,3,10`. Raises ConfigError for one that is not a number or a choice."""
     items = [item.strip() for item in text.split(",")]
     for item in items:
         if not (item in choices if choices else item.isdecimal()):
             known = ", ".join(choices) if choices else "numbers"
-            raise ConfigError(f"{option} {text}: '{item}' cannot be; list {known}, with commas between them")
+            raise ConfigError(f"{option} {text}: '{item}' is not valid; list {known}, separated by commas")
     return items
 
 
-# DeliveryReport.
+# Exactness.
 
 
 def _exactness(args: argparse.Namespace) -> int:
@@ -95,10 +97,10 @@ def _exactness(args: argparse.Namespace) -> int:
         print(HEAD, flush=True)
     line, start, steps, facts = Line(), time.monotonic(), 0, 0
     with _workplace(args.out) as place:
-        for number, config, share in exactness.timed(configs):
+        for number, config, share in exactness.with_progress(configs):
             spent = time.monotonic() - start
             left = f" · {clock(spent / share * (1 - share))} left" if share else ""
-            line.say(f"mission {number} of {len(configs)}{left}")
+            line.show(f"mission {number} of {len(configs)}{left}")
             outcome = exactness.verify(config, policy, place / _name(config))
             steps, facts = steps + outcome.steps, facts + outcome.facts
             line.clear()
@@ -114,7 +116,7 @@ def _exactness(args: argparse.Namespace) -> int:
 
 
 def _configs(args: argparse.Namespace) -> tuple[list[Config], bytes | None]:
-    """Every mission to fly, checked before the first one flies, and the policy that flies it."""
+    """Return every mission to fly, all checked, and the policy that flies. Raises ConfigError."""
     if args.seeds < 1:
         raise ConfigError("--seeds must be 1 or more")
     pilot = policy_spec.resolve(args.who)
@@ -159,20 +161,20 @@ def _name(config: Config) -> str:
 
 def _asynchrony(args: argparse.Namespace) -> int:
     if args.actors < 2 or args.hold <= 0:
-        raise ConfigError("--actors must be 2 or more, and --hold more than 0: somebody has to be ahead of somebody")
+        raise ConfigError("--actors must be 2 or more, and --hold more than 0, so that one UAV can be ahead of another")
     pilot = policy_spec.resolve(args.who)
     base = policy_spec.mission_values(pilot, settings.chosen(args))
     if not args.json:
-        print(f"{args.actors} UAVs, one of them held back by {args.hold * 1000:g} ms a tick\n\n{asynchrony.HEAD}")
-    line, good = Line(), True
+        print(f"{args.actors} UAVs, one of them delayed by {args.hold * 1000:g} ms per tick\n\n{asynchrony.HEAD}")
+    line, passed = Line(), True
     with _workplace(args.out) as place:
         for number, trial in enumerate(asynchrony.TRIALS, 1):
-            line.say(f"flight {number} of {len(asynchrony.TRIALS)}")
+            line.show(f"flight {number} of {len(asynchrony.TRIALS)}")
             result = asynchrony.fly(trial, args.actors, args.hold, base, pilot.policy, place / f"flight-{number}")
             line.clear()
             print(json.dumps(asdict(result)) if args.json else result.row(), flush=True)
-            good &= result.good
-    return process.DONE if good else process.FAILED
+            passed &= result.passed
+    return process.DONE if passed else process.FAILED
 
 
 # Chaos.
@@ -180,7 +182,7 @@ def _asynchrony(args: argparse.Namespace) -> int:
 
 def _chaos(args: argparse.Namespace) -> int:
     line = Line()
-    return verify_chaos.main(args, line.say, line.clear)
+    return verify_chaos.main(args, line.show, line.clear)
 
 
 MAINS: dict[str, Callable[[argparse.Namespace], int]] = {

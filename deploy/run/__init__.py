@@ -1,1 +1,1 @@
-"""What runs a mission: its processes, the supervisor that looks after them, and lock step."""
+"""Runs a mission: its processes with their supervisor, or lock step in one process."""

@@ -1,4 +1,4 @@
-"""The supervisor's side of the forkserver (deploy/run/forkserver.py): processes that are forked, used as `Popen` is."""
+"""The supervisor's side of the forkserver (deploy/run/forkserver.py): forked processes that are used like `Popen`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tmc.wire import process
 
 
 class Handle(Protocol):
-    """What the supervisor needs of a process; subprocess.Popen has it, and Forked."""
+    """The interface of a process that the supervisor needs; subprocess.Popen and Forked have it."""
 
     @property
     def pid(self) -> int | None: ...
@@ -28,9 +28,9 @@ class Handle(Protocol):
 
 
 class ForkServer:
-    """Starts the forkserver when the first process is asked for, and again when it was lost.
+    """Starts a forkserver with the first process, and again if it was lost.
 
-    `command` is its command line, `log` where its own output goes.
+    `command`: its command line. `log`: the file for its own output.
     """
 
     def __init__(self, command: Sequence[str], environment: dict[str, str], log: Path) -> None:
@@ -38,18 +38,20 @@ class ForkServer:
         self._server: subprocess.Popen[bytes] | None = None
         self._children: dict[str, Forked] = {}
         self._rest = b""
+        self.orphans: set[int] = set()
+        """Processes whose server was lost: where they become children of this process, it must wait for them."""
 
     @property
     def pid(self) -> int | None:
-        """The server's process, while there is one."""
+        """The id of the server's process; None while it does not run."""
         return None if self._server is None else self._server.pid
 
     def start(self, name: str, argv: Sequence[str], log: Path) -> Forked:
-        """Fork a process that runs `argv`, with its output in `log`."""
+        """Fork a process that runs `argv`, with its output in the file `log`."""
         if self._server is None:
             self._launch()
         self._children[name] = child = Forked(self, name)
-        self.order({"start": name, "argv": [*argv], "log": str(log.absolute())})
+        self.send_order({"start": name, "argv": [*argv], "log": str(log.absolute())})
         return child
 
     def _launch(self) -> None:
@@ -60,25 +62,25 @@ class ForkServer:
             )  # fmt: skip
         self._rest = b""
 
-    def order(self, order: dict[str, Any]) -> None:
-        """Tell the server to do something; that it is gone shows when it is listened to."""
+    def send_order(self, order: dict[str, Any]) -> None:
+        """Send an order to the server. If the server has ended, mark its processes as ended."""
         assert self._server is not None and self._server.stdin is not None
         data = json.dumps(order).encode() + b"\n"
         try:
             while data:
                 data = data[os.write(self._server.stdin.fileno(), data) :]
         except BrokenPipeError:
-            self.listen(0.0)
+            self.receive_reports(0.0)
 
-    def listen(self, patience: float) -> None:
-        """Take what the server says within `patience` seconds."""
+    def receive_reports(self, timeout: float) -> None:
+        """Handle the server's reports; wait up to `timeout` seconds for the first."""
         if self._server is None or self._server.stdout is None:
             return
         pipe = self._server.stdout.fileno()
-        while select.select([pipe], [], [], patience)[0]:
-            data, patience = os.read(pipe, 65_536), 0.0
+        while select.select([pipe], [], [], timeout)[0]:
+            data, timeout = os.read(pipe, 65_536), 0.0
             if not data:
-                self._lost(self._server.wait())
+                self._on_server_lost(self._server.wait())
                 return
             *lines, self._rest = (self._rest + data).split(b"\n")
             for line in lines:
@@ -87,11 +89,13 @@ class ForkServer:
                 child.pid = report.get("pid", child.pid)
                 child.returncode = report.get("code")
 
-    def _lost(self, code: int) -> None:
-        """The server is gone and its children with it: killed as it was, or failed when it failed by itself."""
+    def _on_server_lost(self, code: int) -> None:
+        """Mark all children as ended: killed by the server's signal, or failed if the server failed."""
         self._close()
         for child in self._children.values():
             if child.returncode is None:
+                if child.pid is not None:
+                    self.orphans.add(child.pid)
                 child.returncode = code if code < 0 else process.FAILED
         self._children.clear()
 
@@ -102,7 +106,7 @@ class ForkServer:
                 pipe.close()
 
     def close(self) -> None:
-        """End the server; whoever is left of its children dies with it."""
+        """End the server; its remaining children end with it."""
         server = self._server
         self._close()
         if server is not None:
@@ -114,7 +118,7 @@ class ForkServer:
 
 
 class Forked:
-    """One process of the forkserver. `pid` is None until the server has said it."""
+    """One process of the forkserver. `pid` is None until the server has reported it."""
 
     def __init__(self, server: ForkServer, name: str) -> None:
         self._server, self.name = server, name
@@ -122,24 +126,24 @@ class Forked:
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
-        """The exit code, negative for a signal; None while it runs."""
+        """Return the exit code, negative for a signal; None while it runs."""
         if self.returncode is None:
-            self._server.listen(0.0)
+            self._server.receive_reports(0.0)
         return self.returncode
 
     def send_signal(self, sig: int) -> None:
-        """By the server, which alone knows that the process id is still this process's."""
+        """Send a signal through the server, which alone knows that the process id still belongs to this process."""
         if self.poll() is None:
-            self._server.order({"signal": int(sig), "name": self.name})
+            self._server.send_order({"signal": int(sig), "name": self.name})
 
     def wait(self, timeout: float | None = None) -> int:
-        """The exit code; raises subprocess.TimeoutExpired after `timeout` seconds."""
+        """Wait for the exit code. Raises subprocess.TimeoutExpired after `timeout` seconds."""
         until = None if timeout is None else time.monotonic() + timeout
         while self.poll() is None:
             left = 3600.0 if until is None else until - time.monotonic()
             if left <= 0:
                 raise subprocess.TimeoutExpired(self.name, timeout or 0.0)
-            self._server.listen(left)
+            self._server.receive_reports(left)
         assert self.returncode is not None
         return self.returncode
 

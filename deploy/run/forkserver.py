@@ -1,10 +1,12 @@
-"""`python -m deploy.run.forkserver --of PACKAGE`: starts processes of one kind by fork: UAVs, or the learner.
+"""`python -m deploy.run.forkserver --of PACKAGE`: forks the processes of one package, UAVs or the learner.
 
-It imports the package's `__main__` once, before any thread or ZeroMQ context exists, so that they share the memory of
-what they all import, and a killed one is back without importing it again. It forks for each order that comes in on
-stdin, a line of JSON: `{"start": NAME, "argv": [...], "log": PATH}`, or `{"signal": NUMBER, "name": NAME}`. On stdout
-it says, a line of JSON each, who started (`{"name": NAME, "pid": PID}`) and who ended
-(`{"name": NAME, "code": CODE}`, negative for a signal). They die with it, and it dies with its supervisor.
+It imports the package's `__main__` once, before any thread or ZeroMQ context exists. So the processes share the memory
+of what they import, and a restarted one does not import it again.
+
+Orders are lines of JSON on stdin: `{"start": NAME, "argv": [...], "log": PATH}`, or `{"signal": NUMBER, "name": NAME}`.
+Reports are lines of JSON on stdout: `{"name": NAME, "pid": PID}` when a process has started, and
+`{"name": NAME, "code": CODE}`, negative for a signal, when it has ended. The processes end with the forkserver, and the
+forkserver ends with its supervisor.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ Main = Callable[[list[str]], int]
 
 
 class ForkServer:
-    """Forks processes that run `main`, called `package`, at the word of the supervisor, and reaps them."""
+    """Forks processes that run `main` of `package` by order of the supervisor, and reaps them."""
 
     def __init__(self, package: str, main: Main) -> None:
         self._package, self._main = package, main
@@ -53,7 +55,7 @@ class ForkServer:
         self._ends = (self._ended, wake)
 
     def serve(self) -> None:
-        """The main loop; ends when the supervisor closes its side."""
+        """Run the main loop until the supervisor closes its side."""
         rest = b""
         while True:
             ready, _, _ = select.select([0, self._ended], [], [])
@@ -67,12 +69,12 @@ class ForkServer:
                     return
                 *lines, rest = (rest + data).split(b"\n")
                 for line in lines:
-                    self._obey(json.loads(line))
+                    self._execute(json.loads(line))
 
-    def _obey(self, order: dict[str, Any]) -> None:
+    def _execute(self, order: dict[str, Any]) -> None:
         if "start" in order:
             self._fork(order["start"], order["argv"], order["log"])
-        elif order["name"] in self._pids:  # not reaped, so the number is still its own
+        elif order["name"] in self._pids:  # not reaped, so the id is still its own
             os.kill(self._pids[order["name"]], order["signal"])
 
     def _fork(self, name: str, argv: list[str], log: str) -> None:
@@ -83,16 +85,16 @@ class ForkServer:
             self._refuse(name, log, f"the system has no room for another process ({error.strerror}): raise ulimit -u")
             return
         if pid == 0:
-            become(self._package, self._main, server, self._ends, argv, log)
+            run_child(self._package, self._main, server, self._ends, argv, log)
         self._pids[name], self._names[pid] = pid, name
-        _say({"name": name, "pid": pid})
+        _send_report({"name": name, "pid": pid})
 
     @staticmethod
     def _refuse(name: str, log: str, text: str) -> None:
         """Report a process that could not be started, with the reason as its output."""
         with contextlib.suppress(OSError), Path(log).open("a", encoding="utf-8") as output:
             output.write(f"{process.ERROR}{text}\n")
-        _say({"name": name, "code": process.FAILED})
+        _send_report({"name": name, "code": process.FAILED})
 
     def _reap(self) -> None:
         while self._names:
@@ -101,23 +103,23 @@ class ForkServer:
                 return
             name = self._names.pop(pid)
             del self._pids[name]
-            _say({"name": name, "code": os.waitstatus_to_exitcode(status)})
+            _send_report({"name": name, "code": os.waitstatus_to_exitcode(status)})
 
 
-def _say(report: dict[str, Any]) -> None:
+def _send_report(report: dict[str, Any]) -> None:
     data = json.dumps(report).encode() + b"\n"
     while data:
         data = data[os.write(1, data) :]
 
 
-def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
-    """Turn the forked process into that of `argv`, with nothing of the server's but its memory; never returns."""
+def run_child(package: str, main: Main, server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
+    """Run `main(argv)` in a forked process that has nothing of the server but its memory; never returns."""
     code = process.FAILED
     try:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        os.setsid()  # Ctrl-C in the terminal is for the supervisor, who ends all in order
+        os.setsid()  # Ctrl-C in the terminal is for the supervisor, which ends all in order
         output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         for old, new in ((os.open(os.devnull, os.O_RDONLY), 0), (output, 1), (output, 2)):
             os.dup2(old, new)
@@ -128,7 +130,7 @@ def become(package: str, main: Main, server: int, ends: tuple[int, int], argv: l
         code = main(argv)
     except SystemExit as left:  # argparse
         code = left.code if isinstance(left.code, int) else process.FAILED
-    except BaseException as error:  # the traceback belongs into the log, and nothing may get back into the loop
+    except BaseException as error:  # the traceback goes to the log, and no exception may reach the server's loop
         traceback.print_exc()
         process.tell(f"{type(error).__name__}: {error}")
     finally:
@@ -147,11 +149,11 @@ def set_title(package: str, argv: Sequence[str]) -> None:
     setproctitle(printable(" ".join((TITLE, package, *argv))))
 
 
-def _do_without(a: argparse.Namespace) -> None:
-    """Start over without what is preloaded, since it started threads: a fork does not take them along.
+def _restart_without_preload(a: argparse.Namespace) -> None:
+    """Start the server again without preloaded modules, because one started a thread, which a fork would not have.
 
-    The process, its pipes and the orders that wait in them stay. Where the package itself starts threads, there is
-    nothing to leave out, and the forks go ahead: what a thread held then is lost to them.
+    The process id, the pipes and the orders in them stay. If the package itself starts threads, there is nothing to
+    leave out, and the processes are forked without those threads.
     """
     process.note(f"{process.threads()} threads run after importing {', '.join([a.of, *a.preload])}")
     if a.preload:
@@ -161,7 +163,7 @@ def _do_without(a: argparse.Namespace) -> None:
 
 
 def _program(package: str, preload: Sequence[str]) -> Main:
-    """What the processes run; where something cannot be imported, each says so in a sentence, and is not restarted."""
+    """Import and return what the processes run; if that fails, each process prints a sentence and is not restarted."""
     try:
         run: Main = importlib.import_module(f"{package}.__main__").main
         for module in preload:
@@ -179,7 +181,7 @@ def _refuse(sentence: str) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Import, freeze, serve."""
+    """Import the package, freeze its objects, and serve until the supervisor closes stdin; return the exit code."""
     parser = Options("deploy.run.forkserver", description=__doc__)
     parser.add_argument("--of", required=True, metavar="PACKAGE", help="whose __main__ the processes run")
     parser.add_argument("--preload", action="append", default=[], metavar="MODULE", help="what all of them will need")
@@ -189,9 +191,9 @@ def main(argv: list[str] | None = None) -> int:
     process.become_child(a.parent)
     run = _program(a.of, a.preload)
     if process.threads() > 1:
-        _do_without(a)
+        _restart_without_preload(a)
     gc.collect()
-    gc.freeze()  # what is here now is never collected, so a collection in a process does not copy its pages
+    gc.freeze()  # objects from before the fork are never collected, so a collection does not copy their pages
     with contextlib.suppress(BrokenPipeError):
         ForkServer(a.of, run).serve()
     return process.DONE

@@ -1,4 +1,4 @@
-"""Starts processes that compute something and print it, and says how one died."""
+"""Starts helper processes that compute something and print it, and reports how one failed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tmc.wire.process import FailedError
 def start(module: str, *words: object, env: Mapping[str, str]) -> subprocess.Popen[str]:
     """Start `python -P -m MODULE WORDS --parent PID`, which imports nothing from the current folder.
 
-    It has a session of its own: Ctrl-C in the terminal is for its parent, which ends it.
+    It has its own session, so Ctrl-C in the terminal goes to its parent, which ends it.
     """
     line = [sys.executable, "-P", "-m", module, *map(str, words), "--parent", str(os.getpid())]
     return subprocess.Popen(
@@ -24,7 +24,7 @@ def start(module: str, *words: object, env: Mapping[str, str]) -> subprocess.Pop
 
 
 def output_of(helper: subprocess.Popen[str], given: str = "") -> str:
-    """Wait for its end, after giving it `given` on stdin; returns what it printed. Raises FailedError if it failed."""
+    """Send `given` to its stdin, wait for its end, and return what it printed. Raises FailedError if it failed."""
     try:
         printed, _ = helper.communicate(given)
     finally:

@@ -1,4 +1,4 @@
-"""One line on stderr that tells how far the work is: written over on a terminal, a line now and then elsewhere."""
+"""One line of progress on stderr: overwritten on a terminal, printed now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from typing import Self, TextIO
 from tmc.kernel.text import printable
 
 TERMINAL_EVERY_S, PLAIN_EVERY_S = 0.2, 5.0
-"""Time between two lines on a terminal, and where the output is none."""
+"""Time (s) between two lines on a terminal, and elsewhere."""
 BETWEEN = " · "
 
 Part = tuple[int, str]
-"""A piece of the line, and its rank: where the terminal is narrow, that of the largest number is left out first."""
+"""A part of the line, with its rank: on a narrow terminal, the part of the largest rank is left out first."""
 
 
 class Line:
-    """Never raises: a stderr that is closed, full or gone must not fail the work.
+    """Shows progress; as a context manager, clears the line at its end.
 
-    A context that clears the line at its end. `delay`: seconds before the first, so that what is done at once says
-    nothing.
+    It never raises: a stderr that is closed, full or gone must not fail the work. `delay`: time (s) before the first
+    line, so that short work shows none.
     """
 
     def __init__(self, out: TextIO | None = None, delay: float = 0.0) -> None:
@@ -33,11 +33,11 @@ class Line:
         self._next = time.monotonic() + delay
 
     def due(self) -> bool:
-        """True when it is time for the next line."""
+        """Return whether it is time for the next line."""
         return time.monotonic() >= self._next
 
-    def say(self, *parts: Part | str) -> None:
-        """Show a line, when it is time to."""
+    def show(self, *parts: Part | str) -> None:
+        """Show a line, if one is due."""
         if self.due():
             self._next = time.monotonic() + (TERMINAL_EVERY_S if self._terminal else PLAIN_EVERY_S)
             ranked = [part if isinstance(part, tuple) else (0, part) for part in parts]
@@ -47,16 +47,16 @@ class Line:
                 self._put(fit(ranked, 0) + "\n")
 
     def share(self, what: str, share: float) -> None:
-        """Show how much of something is done, when it is time to."""
-        self.say(f"{what}: {share:.0%}")
+        """Show which share in [0, 1] of something is done, if a line is due."""
+        self.show(f"{what}: {share:.0%}")
 
-    def keep(self, text: str) -> None:
-        """Write a line that stays."""
+    def print(self, text: str) -> None:
+        """Print a line that stays."""
         self.clear()
         self._put(printable(text) + "\n")
 
     def clear(self) -> None:
-        """End the line that is written over, to make room for one that stays."""
+        """Erase the line of progress, to make room for one that stays."""
         if self._terminal and self._width:
             self._write_over("")
             self._put("\r")
@@ -68,7 +68,7 @@ class Line:
         self.clear()
 
     def _write_over(self, text: str) -> None:
-        """By spaces, since not every terminal knows how to erase; not beyond its end, were it made narrower since."""
+        """Overwrite the line, padded by spaces, since not every terminal can erase; not beyond the terminal's width."""
         room = columns(self._out) - 1
         width = self._width if room <= 0 else min(self._width, room)
         self._put("\r" + text.ljust(width))
@@ -81,7 +81,7 @@ class Line:
 
 
 def fit(parts: list[Part], room: int) -> str:
-    """The parts on one line of at most `room` characters, without those that are least wanted; 0 or less: no end."""
+    """Return the parts as one line of at most `room` characters, without those of the largest ranks; 0: no limit."""
     kept = [(rank, printable(text)) for rank, text in parts]
     while (text := BETWEEN.join(text for _, text in kept)) and 0 < room < len(text) and len(kept) > 1:
         kept.remove(max(kept))
@@ -89,7 +89,7 @@ def fit(parts: list[Part], room: int) -> str:
 
 
 def columns(out: TextIO) -> int:
-    """How wide the terminal is now; 0 where that is not known. COLUMNS has the last word, as everywhere."""
+    """Return the current width of the terminal, 0 if unknown. The environment variable COLUMNS takes precedence."""
     with suppress(ValueError):
         if (chosen := int(os.environ.get("COLUMNS", ""))) > 0:
             return chosen

@@ -1,4 +1,4 @@
-"""The same mission in one process: the station, the pilots and, where there is one, the trainer take turns."""
+"""Runs a mission in one process: the station, the pilots and, if there is one, the trainer take turns."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from deploy.run.progress import Progress
 from tmc.center.journal import Journal
 from tmc.center.roster import LEARNER, Outbox, uav_name
 from tmc.center.station import Station
-from tmc.center.status import status
 from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
+from tmc.record.run_folder import RunFolder
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 
 RUN = "lockstep"
-"""What its log calls the run of a mission in one process."""
+"""The run's name in the log of a mission in one process."""
 KeepHashes = Callable[[int, Any], None]
-"""Takes UAV i's overfly.ObservationHashes to the moves of a record."""
+"""Takes (uav, overfly.ObservationHashes of the moves of a record)."""
 
 
 class LockStep:
     """A mission without sockets. `keep` gets every outbox of the station before its messages are delivered.
 
-    `keep_hashes`: who wants to know what the UAVs decide by; None outside of trials.
+    `keep_hashes` gets the hashes of what the UAVs decide by; None outside of trials.
     """
 
     def __init__(
@@ -70,9 +70,9 @@ class LockStep:
         self.fleet = Fleet(pilots, self._exchange)
         self._minibatches: list[m.Minibatch] = []
         self._loss, self.final = 0.0, b""
-        """Of the last update, and the policy file that was learned, once all has been."""
+        """The loss of the last update, and at the end the learned policy file."""
         if trainer is not None:
-            from learner.batching import BatchBuilder  # noqa: PLC0415  torch only where something is learned
+            from learner.batching import BatchBuilder  # noqa: PLC0415  torch only where there is a learner
 
             self._builder = BatchBuilder(observer)
 
@@ -80,56 +80,56 @@ class LockStep:
         if self.keep_hashes is not None and isinstance(message, m.Record):
             self.keep_hashes(uav, self._hashers[uav].hashes_for(message))
         self.station.handle(uav_name(uav), message, 0.0)
-        return self._take()
+        return self._collect()
 
-    def _take(self) -> list[tuple[int, m.Message]]:
+    def _collect(self) -> list[tuple[int, m.Message]]:
         outbox = self.station.out.take()
         self.keep(outbox)
-        self.station.committed()  # in one process nothing is lost that another one needs
+        self.station.committed()  # in one process no message waits for the disk
         self._minibatches += [x for to, x in outbox.sends if to == LEARNER and isinstance(x, m.Minibatch)]
         return [(int(to.removeprefix("uav-")), x) for to, x in outbox.sends if to.startswith("uav-")]
 
-    def _tell(self, message: m.Message) -> None:
-        """The learner says something; what the station has for the UAVs is delivered."""
+    def _send_as_learner(self, message: m.Message) -> None:
+        """Send a message of the learner to the station, and deliver the station's messages to the UAVs."""
         self.station.handle(LEARNER, message, 0.0)
-        for uav, reply in self._take():
+        for uav, reply in self._collect():
             self.fleet.deliver(uav, reply)
 
     def run(self, show: Callable[[m.Status], None] | None = None) -> None:
-        """Fly all episodes."""
+        """Fly all episodes. `show` gets the status after every step. Raises FlightError, TrainingError."""
         if self.trainer is not None:
-            self._tell(m.Hello("learner", -1, 1))
-            self._push()
-            self._tell(m.SampleRequest(0))
+            self._send_as_learner(m.Hello("learner", -1, 1))
+            self._publish()
+            self._send_as_learner(m.SampleRequest(0))
         for pilot in self.fleet.pilots:
             for uav, reply in self._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
                 self.fleet.deliver(uav, reply)
         while self.fleet.step() | self._learn():
             if show is not None:
-                show(status(self.station))
+                show(self.station.status())
         if self.trainer is not None:
-            self.final = self._push(self._loss)  # what a learner's process says last
+            self.final = self._publish(self._loss)  # as the learner's process does at its end
 
     def _learn(self) -> bool:
-        """Train on every minibatch that the limiter lets through; True when there was one."""
+        """Train on every minibatch that the rate limiter allows; return whether there was one."""
         trainer, learned = self.trainer, False
         while trainer is not None and self._minibatches:
             metrics = trainer.update(self._builder.build(self._minibatches.pop(0)))
             learned, self._loss = True, metrics.loss
             if metrics.updates % self.world.config.training.publish_every == 0:
-                self._push(metrics.loss)
-            self._tell(m.SampleRequest(metrics.updates, *trainer.take_td_errors()))
+                self._publish(metrics.loss)
+            self._send_as_learner(m.SampleRequest(metrics.updates, *trainer.take_td_errors()))
         return learned
 
-    def _push(self, loss: float = 0.0) -> bytes:
+    def _publish(self, loss: float = 0.0) -> bytes:
         assert self.trainer is not None
         version, model = self.trainer.policy()
-        self._tell(m.PolicyPush(version, self.trainer.updates, loss, model))
+        self._send_as_learner(m.PolicyPush(version, self.trainer.updates, loss, model))
         return model
 
 
 def _controller_maker(world: World, observer: ObservationBuilder) -> Callable[[bytes], Controller]:
-    """UAVs in one process share the session of a policy file; it holds no state of theirs."""
+    """Return a maker of controllers that shares one session of a policy file among all UAVs; it holds no state."""
     made: dict[bytes, Controller] = {}
 
     def make(model: bytes) -> Controller:
@@ -144,11 +144,11 @@ def _controller_maker(world: World, observer: ObservationBuilder) -> Callable[[b
 
 
 def run(world: World, out: Path, policy: Path | None, progress: Progress) -> None:
-    """Fly a mission in this process, with the same log as the TMC process writes."""
+    """Fly a mission in this process, with the journal of a TMC's process. Raises ConfigError, FlightError."""
     config = world.config
     trainer = None
     if policy is None and config.team.controller == "policy":
-        from learner.trainer import start  # noqa: PLC0415  torch only where something is learned
+        from learner.trainer import start  # noqa: PLC0415  torch only where there is a learner
 
         trainer = start(config, world.grid)
     journal = Journal(out, world, RUN)
@@ -157,19 +157,19 @@ def run(world: World, out: Path, policy: Path | None, progress: Progress) -> Non
             mission = LockStep(world, policy.read_bytes() if policy else None, journal.take, trainer, keep_hashes)
             _run(mission, progress.show)
         if trainer is not None:
-            from learner.service import write_policy  # noqa: PLC0415
+            from learner.service import write_policy  # noqa: PLC0415  torch only where there is a learner
 
-            write_policy(out / "policies" / "final.onnx", mission.final)
+            write_policy(RunFolder(out).final_policy, mission.final)
     finally:
         journal.writer.close()
 
 
 def _run(mission: LockStep, show: Callable[[m.Status], None]) -> None:
-    """Fly and learn; ConfigError where the training diverges."""
+    """Fly and learn. Raises ConfigError if the training diverges."""
     if mission.trainer is None:
         mission.run(show)
         return
-    from learner.batching import TrainingError  # noqa: PLC0415  torch only where something is learned
+    from learner.batching import TrainingError  # noqa: PLC0415  torch only where there is a learner
 
     try:
         mission.run(show)
@@ -179,7 +179,7 @@ def _run(mission: LockStep, show: Callable[[m.Status], None]) -> None:
 
 @contextmanager
 def _hash_logs(world: World, out: Path) -> Iterator[KeepHashes | None]:
-    """Where witnesses keep_hashes: in the logs that the UAVs would write; nowhere outside of trials."""
+    """Yield a function that writes hashes to the logs that the UAVs would write; None outside of trials."""
     config = world.config
     if not config.trial.observation_hash:
         yield None

@@ -1,6 +1,6 @@
-"""What a mission takes of this machine, against what the system allows: looked at before any process starts.
+"""Checks, before any process starts, that the system allows what a mission needs. Raises soft limits where it may.
 
-The figures are low: whoever has less than them cannot fly. Limits that may be raised without asking are raised.
+The figures are low: with less, the mission cannot fly.
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ CGROUPS, OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 FILES, THREADS, MEMORY, ADDRESSES, SIZE, DISK = "files", "threads", "memory", "addresses", "size", "disk"
 BYTES = {MEMORY, ADDRESSES, SIZE, DISK}
 LOG_BYTES, STEP_BYTES = 16_384, 3
-"""Of the TMC's log, at its start and for each step of a UAV; most flights leave several times as many."""
+"""Least size of the TMC's log, at its start and per UAV step; most flights leave several times as much."""
 HORIZON_TICKS = 10_000_000
-"""About a day's flight: what comes later is not asked for now, since a training without an end may be stopped."""
+"""About a day of flight: later needs are not checked, since a training without an end is stopped some time."""
 ROW_BYTES = 15
-"""Of the replay memory, for each transition, without the maps (`tmc.center.replay.Replay`)."""
+"""Bytes per transition of the replay memory, without the maps (`tmc.center.replay.Replay`)."""
 
 
 @dataclass(frozen=True)
 class Need:
-    """What one limit must allow: at least so much of what, in words with a place for it, and how more of it is had."""
+    """What one limit must allow.
+
+    `what`: its kind. `amount`: the least. `words`: a phrase with a place for the amount. `fix`: how to get more.
+    """
 
     what: str
     amount: int
@@ -39,7 +42,7 @@ class Need:
     fix: str
 
     def missed(self, uavs: int, allowed: int) -> str:
-        """The sentence where the system allows less."""
+        """Return the sentence for a system that allows less."""
         need, have = (_bytes(n) if self.what in BYTES else f"{n:,}" for n in (self.amount, allowed))
         team = f"{uavs:,} UAV" + ("" if uavs == 1 else "s")
         verb = "needs" if uavs == 1 else "need"
@@ -51,9 +54,9 @@ def _bytes(size: int) -> str:
 
 
 def require(config: Config, *, learns: bool, alone: bool = False, out: Path = Path()) -> None:
-    """Raise soft limits where they are too low; ConfigError where that does not do.
+    """Raise soft limits that are too low. Raises ConfigError if that does not suffice.
 
-    `alone`: only the TMC is on this machine. `out`: a folder on the disk that is written to.
+    `learns`: the mission has a learner. `alone`: only the TMC runs here. `out`: a folder on the disk of the run.
     """
     for need in needs(config, learns=learns, alone=alone):
         allowed = ALLOWED[need.what](need, out)
@@ -62,13 +65,13 @@ def require(config: Config, *, learns: bool, alone: bool = False, out: Path = Pa
 
 
 def needs(config: Config, *, learns: bool, alone: bool = False) -> Iterator[Need]:
-    """Every limit that matters to a mission."""
+    """Yield every need of a mission."""
     n, steps = config.team.size, config.team.size * min(config.training.ticks * config.training.episodes, HORIZON_TICKS)
     planner = config.team.controller.startswith(PREFIX)
     replay = ROW_BYTES * min(config.replay.capacity, steps) if learns else 0
     log = LOG_BYTES + STEP_BYTES * steps
     table = 0 if alone else table_bytes(n, config.training.ticks)
-    files = n + 32  # a connection each, and what the TMC has open itself
+    files = n + 32  # one connection per UAV, and the TMC's own files
     yield Need(FILES, files, "{} open files in the TMC", f"run `ulimit -n {_round(files)}` first")
     yield Need(SIZE, max(log, table), "files of {}", "run `ulimit -f unlimited` first")
     yield Need(DISK, log, "{} of disk for their logs", "free some space, choose another --out")
@@ -84,7 +87,7 @@ def needs(config: Config, *, learns: bool, alone: bool = False) -> Iterator[Need
 
 
 def _round(amount: int) -> int:
-    """The next power of two that leaves room for what else is open."""
+    """Return a power of two with room for other files."""
     return int(max(1024, 2 ** (2 * amount - 1).bit_length()))
 
 
@@ -93,9 +96,9 @@ def _files(need: Need, _: Path) -> int | None:
 
 
 def _threads(need: Need, _: Path) -> int | None:
-    """What is left of the threads that this user, and this container, may have."""
+    """Return how many more threads this user and this container may have."""
     left = [most - used for most, used in cgroup_limits("pids", "pids.max", "pids.current")]
-    if os.geteuid() != 0:  # root may have as many as the machine can
+    if os.geteuid() != 0:  # root has no limit
         used = threads_of_user()
         most = raised(resource.RLIMIT_NPROC, used + 2 * need.amount, used + need.amount)
         left += [] if most is None else [max(0, most - used)]
@@ -103,7 +106,7 @@ def _threads(need: Need, _: Path) -> int | None:
 
 
 def _memory(_: Need, __: Path) -> int | None:
-    """All memory of the machine, or of the container."""
+    """Return the bytes of all memory of the machine, or of the container."""
     most = [limit for limit, _ in cgroup_limits("memory", "memory.max", "memory.current")]
     most += [limit for limit, _ in cgroup_limits("memory", "memory.limit_in_bytes", "memory.usage_in_bytes")]
     with suppress(OSError, ValueError):
@@ -122,7 +125,7 @@ def _size(need: Need, _: Path) -> int | None:
 
 
 def _disk(_: Need, out: Path) -> int | None:
-    """Free bytes of the disk that a run folder will be on: of the nearest folder that is there."""
+    """Return the free bytes of the disk of a run folder, by the nearest folder that exists."""
     for folder in (out, *out.absolute().parents):
         with suppress(OSError):
             return shutil.disk_usage(folder).free
@@ -130,11 +133,11 @@ def _disk(_: Need, out: Path) -> int | None:
 
 
 ALLOWED = {FILES: _files, THREADS: _threads, MEMORY: _memory, ADDRESSES: _addresses, SIZE: _size, DISK: _disk}
-"""By what is limited: how much the system allows, None where it does not say."""
+"""By kind: a function that returns how much the system allows, None if there is no limit."""
 
 
 def raised(kind: int, wish: int, need: int) -> int | None:
-    """The soft limit, after it was raised towards `wish` where it is below `need`; None where there is none."""
+    """Raise a soft limit below `need` towards `wish`; return the new limit, None if there is none."""
     soft, hard = resource.getrlimit(kind)
     if soft != resource.RLIM_INFINITY and soft < need:
         aim = hard if wish == resource.RLIM_INFINITY else wish if hard == resource.RLIM_INFINITY else min(wish, hard)
@@ -145,7 +148,7 @@ def raised(kind: int, wish: int, need: int) -> int | None:
 
 
 def threads_of_user() -> int:
-    """Threads of all processes of this user; RLIMIT_NPROC counts them."""
+    """Count the threads of all processes of this user, as RLIMIT_NPROC does."""
     count = 0
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError, ValueError, KeyError):
@@ -156,7 +159,7 @@ def threads_of_user() -> int:
 
 
 def cgroup_limits(controller: str, limit: str, usage: str) -> Iterator[tuple[int, int]]:
-    """(limit, use) of this process's control groups, from its own upwards, of those that have a limit."""
+    """Yield (limit, use) of the control groups of this process that have a limit, from its own upwards."""
     with suppress(OSError, ValueError):
         for line in OWN_CGROUP.read_text("utf-8").splitlines():
             _, kinds, path = line.split(":", 2)

@@ -1,4 +1,4 @@
-"""A mission from its config to its run folder: processes or lock step, then the summary and the pictures."""
+"""Runs a mission from its config to its run folder: as processes or in lock step."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -20,12 +21,10 @@ from deploy.run import lockstep, plan
 from deploy.run.progress import Progress, StatusPoller
 from deploy.run.supervisor import MissionFailed, Supervisor
 from tmc.analysis.run_config import attachments, settings_of
-from tmc.center.journal import journal_in
 from tmc.kernel import files, forecast
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.files import plain
 from tmc.kernel.policy import FlightError, check_view, view_shape
-from tmc.kernel.roadmap import COPY
 from tmc.kernel.text import suggestion
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World, world_of_run
@@ -33,14 +32,15 @@ from tmc.record import disk
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import compact_log
 from tmc.record.reader import Log
+from tmc.record.run_folder import RunFolder
 from tmc.wire import capacity, process
 
 POLL_S = 0.1
-"""Seconds between two looks at the processes."""
+"""Interval (s) at which the processes are checked."""
 
 
 def new_folder(out: Path | None, name: str) -> Path:
-    """The run folder, which must not hold anything yet; by default `runs/<name>-<time>`."""
+    """Make and return the run folder, which must be empty; by default `runs/<name>-<time>`. Raises ConfigError."""
     if out is None:
         stamp = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
         out = Path("runs") / f"{name}-{stamp}"
@@ -58,7 +58,7 @@ def new_folder(out: Path | None, name: str) -> Path:
 
 
 def bound_of(world: World) -> float:
-    """What no team can beat: the lower bound of eq. (6) in scenario II from a visited map, otherwise 0 (unknown)."""
+    """Return the lower bound of eq. (6) in scenario II from a visited map, which no team can beat; otherwise 0."""
     config = world.config
     if config.scenario != 2 or config.world.initial_map != "visited":
         return 0.0
@@ -66,7 +66,7 @@ def bound_of(world: World) -> float:
 
 
 def check(config: Config, policy: bytes | None = None, name: str = "the policy") -> World:
-    """The world of a mission, once everything that can be wrong with its settings has been looked at.
+    """Check all settings of a mission, and its policy; return its world. Raises ConfigError, PolicyError, MapError.
 
     `name`: what messages call the policy.
     """
@@ -80,7 +80,7 @@ def check(config: Config, policy: bytes | None = None, name: str = "the policy")
 
 
 def _check(world: World, policy: bytes | None, name: str) -> None:
-    """Whether a mission can be flown in a world."""
+    """Raise ConfigError or PolicyError if a mission cannot be flown in a world."""
     config = world.config
     learning = policy is None and not policy_spec.is_planner(config)
     if policy is not None:
@@ -90,55 +90,59 @@ def _check(world: World, policy: bytes | None, name: str) -> None:
     capacity.check(world, learning=learning)
 
 
-def check_training(config: Config) -> None:
+def check_training(config: Config, say: Callable[[str], None] = process.tell) -> None:
     """Raise ConfigError where nothing would be learned in a whole mission; and say what else will not be done."""
     if policy_spec.is_planner(config):
         return
     if idle := forecast.idle(config):
         raise ConfigError(idle)
     for sentence in forecast.remarks(config):
-        process.tell(sentence)
+        say(sentence)
 
 
 def needs(config: Config, policy: bytes | None) -> tuple[str, ...]:
-    """The extras that a mission on this machine needs: only one without a fixed policy or a planner has a learner."""
+    """Return the extras that a mission needs: without a fixed policy or a planner, it needs the learner's."""
     return () if policy is not None or policy_spec.is_planner(config) else (extras.LEARNER,)
 
 
 def flown_policy(out: Path) -> Path:
-    """The fixed policy of a run that flies one."""
-    return out / "policies" / "flown.onnx"
+    """Return the path of the fixed policy of a run."""
+    return RunFolder(out).fixed_policy
 
 
 def require_settings(out: Path) -> Config:
-    """The settings that a run in `out` was begun with; ConfigError where `config.json` has others, or it has none."""
-    journal = journal_in(out)
+    """Return the settings that a run in `out` was started with. Raises ConfigError if `config.json` was edited."""
+    journal = RunFolder(out).existing_journal()
     if journal is None:
         raise ConfigError(f"{out} holds no journal (tmc.mcap): --resume takes the folder of a run that was begun")
     settings = settings_of(out, journal)
     if settings.edited:
         keys = ", ".join(settings.edited)
         mend = "put it back, or remove the file and the log's settings are used; other settings need a run of their own"
-        raise ConfigError(f"{out / 'config.json'} was edited since the run was begun, in {keys}: {mend}")
+        raise ConfigError(f"{RunFolder(out).config} was edited since the run was begun, in {keys}: {mend}")
     return settings.config
 
 
-def interrupted(out: Path) -> tuple[World, bytes | None]:
-    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError."""
+def interrupted(out: Path, say: Callable[[str], None] = process.tell) -> tuple[World, bytes | None]:
+    """The world and the fixed policy of a run that was begun in `out`, to go on with it; raises ConfigError.
+
+    `say` takes a sentence on what is damaged.
+    """
     config = require_settings(out)
-    journal = journal_in(out)
+    journal = RunFolder(out).existing_journal()
     assert journal is not None
-    with disk.open_held(journal, "rb"):
+    with disk.open_locked(journal, "rb"):
         log = Log(journal)  # nobody writes it
     if log.damage and not log.still_open:
         text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
-        process.tell(f"{text}, and `overfly log recover` says what else is in it")
+        say(f"{text}, and `overfly log recover` says what else is in it")
     file = flown_policy(out)
     policy = files.read_bytes(file) if file.exists() else None
     world = world_of_run(config, out)
     _check(world, policy, str(file))
     if attachments(journal).get("map.csv", world.map.csv()) != world.map.csv():
-        name = out / COPY if (out / COPY).exists() else config.world.map
+        copy = RunFolder(out).map_copy
+        name = copy if copy.exists() else config.world.map
         raise ConfigError(f"the map {name} has changed since the run was begun: put it back as it was")
     if log.metadata().get("run") == lockstep.RUN and policy is None and not policy_spec.is_planner(config):
         raise ConfigError(f"{out} was trained in lock step, which leaves no checkpoint to go on from: run it again")
@@ -146,35 +150,34 @@ def interrupted(out: Path) -> tuple[World, bytes | None]:
 
 
 def keep_settings(out: Path, world: World, policy: bytes | None) -> Path | None:
-    """Put down what a run flies by, before it begins: `config.json`, a user's map, and the fixed policy, whose path it
-    returns.
+    """Write `config.json`, a user's map and the fixed policy, before the run starts; return the policy's path.
 
-    On the disk at once, since after a power cut there is no journal yet that has a copy.
+    All are synced at once, because after a power cut no journal has a copy yet.
     """
-    disk.put(out / "config.json", (json.dumps(flat(world.config), indent=1) + "\n").encode(), sync=True)
+    disk.write_atomically(RunFolder(out).config, (json.dumps(flat(world.config), indent=1) + "\n").encode(), sync=True)
     if world.map.source:
-        disk.put(out / COPY, world.map.source.encode(), sync=True)
+        disk.write_atomically(RunFolder(out).map_copy, world.map.source.encode(), sync=True)
     if policy is None:
         return None
     file = flown_policy(out)
     file.parent.mkdir(parents=True, exist_ok=True)
-    disk.put(file, policy, sync=True)
+    disk.write_atomically(file, policy, sync=True)
     return file
 
 
 def finished(out: Path) -> bool:
-    """True when the processes of the run in `out` came to its end, all of them in order."""
-    codes = _told(out).get("exit_codes", {})
-    return set(codes.values()) == {0} and (out / "tmc.mcap").exists()
+    """Return whether all processes of the run in `out` ended in order."""
+    codes = _run_facts(out).get("exit_codes", {})
+    return set(codes.values()) == {0} and RunFolder(out).journal.exists()
 
 
-def _told(out: Path) -> dict[str, Any]:
-    """What `run.json` says; nothing where it is gone or broken."""
+def _run_facts(out: Path) -> dict[str, Any]:
+    """Return the contents of `run.json`; an empty dict if it is missing or damaged."""
     try:
-        told = json.loads(files.read_text(out / "run.json"))
+        facts = json.loads(files.read_text(RunFolder(out).outcome))
     except (OSError, ValueError):
         return {}
-    return told if isinstance(told, dict) else {}
+    return facts if isinstance(facts, dict) else {}
 
 
 class Mission:
@@ -194,14 +197,42 @@ class Mission:
         self.policy = keep_settings(out, world, policy)
         self.flies = flies or str(self.policy)
         self.progress = progress or Progress(config, self.world.law.cells.size, bound_of(self.world))
-        self._begun, self._began_at, self._start = _told(out), datetime.now(UTC), time.monotonic()
+        self._begun, self._began_at, self._start = _run_facts(out), datetime.now(UTC), time.monotonic()
         self._ended: dict[str, Any] = {}
         self._folder = out.stat()
         self._write_run(self._ended)
 
     def run(self, *, in_one_process: bool) -> int:
-        """Fly it; returns the exit code. What it left is in the run folder either way."""
-        code, said = process.DONE, ""
+        """Fly it, and say why when it did not come to its end; returns the exit code. Raises as `fly` otherwise."""
+        try:
+            self.fly(in_one_process=in_one_process)
+        except MissionFailed as failed:
+            self.progress.note(str(failed))
+            return process.FAILED
+        except KeyboardInterrupt as stopped:
+            return 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
+        return process.DONE
+
+    def fly(self, *, in_one_process: bool) -> None:
+        """Fly it to its end. What it left is in the run folder either way.
+
+        Raises MissionFailed; KeyboardInterrupt, once all processes have ended in order; RecordError when the journal
+        cannot be written.
+        """
+        try:
+            self._fly_and_compact(in_one_process=in_one_process)
+        except RecordError:
+            if self._is_there():
+                raise
+            raise MissionFailed(self._gone()) from None
+        except (MissionFailed, FlightError) as failed:
+            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
+            raise MissionFailed(f"{failed}{which}") from None
+        except KeyboardInterrupt:
+            self.progress.note(f"stopped; what was flown is in {self.out}")
+            raise
+
+    def _fly_and_compact(self, *, in_one_process: bool) -> None:
         try:
             if in_one_process:
                 lockstep.run(self.world, self.out, self.policy, self.progress)
@@ -209,22 +240,9 @@ class Mission:
             else:
                 self._fly()
             self._compact()
-        except RecordError:
-            if self._is_there():
-                raise
-            code, said = process.FAILED, self._gone()
-        except (MissionFailed, FlightError) as failed:
-            which = f" (policy 1 is {self.flies})" if self.policy and "policy 1" in str(failed) else ""
-            code, said = process.FAILED, f"{failed}{which}"
-        except KeyboardInterrupt as stopped:
-            code = 128 + (stopped.args[0] if stopped.args else signal.SIGINT)
-            said = f"stopped; what was flown is in {self.out}"
         finally:
             self._write_run(self._ended)  # first of all: what is said goes to a terminal that may be gone
             self.progress.clear()
-        if said:
-            self.progress.note(said)
-        return code
 
     def _fly(self) -> None:
         mission = plan.make(self.config, self.out, policy=self.policy)
@@ -247,7 +265,7 @@ class Mission:
             self._ended = {"exit_codes": supervisor.exit_codes(), "restarts": supervisor.restarts()}
 
     def _is_there(self) -> bool:
-        """False once the run folder was removed or moved: nothing that is flown from then on can be kept."""
+        """Return False once the run folder was removed or moved, since the flight can no longer be logged."""
         try:
             return os.path.samestat(self._folder, self.out.stat())
         except OSError:
@@ -257,17 +275,17 @@ class Mission:
         return f"the run folder {self.out} was removed or moved while the mission was flown: fly it again"
 
     def _compact(self) -> None:
-        """Rewrite the journal of a mission that is over for keeping; its sizes are in `run.json`."""
+        """Compact the journal of a finished mission; its sizes go to `run.json`."""
         try:
-            compacted = compact_log(self.out / "tmc.mcap", self.progress.work)
-        except RecordError as error:  # all of it is there, in small chunks
-            self.progress.note(f"the log stays as it was written: {error}")
+            compacted = compact_log(RunFolder(self.out).journal, self.progress.work)
+        except RecordError as error:  # the log is complete, in small chunks
+            self.progress.note(f"the log was not compacted: {error}")
         else:
             self._ended["compacted"] = {"before": compacted.before, "after": compacted.after}
 
     def _write_run(self, more: dict[str, Any]) -> None:
-        """`run.json`: what was run, and resumed, with which versions, and how each process ended."""
-        if not self._is_there():  # that is said
+        """Write `run.json`: the commands that ran and resumed it, the versions, and how each process ended."""
+        if not self._is_there():  # which is reported
             return
         facts = {
             "command": self._begun.get("command", self.command),
@@ -279,11 +297,12 @@ class Mission:
             "seconds": round(time.monotonic() - self._start, 1),
         }
         try:
-            disk.put(self.out / "run.json", (json.dumps(facts | more, indent=1) + "\n").encode(), sync=False)
+            text = json.dumps(facts | more, indent=1) + "\n"
+            disk.write_atomically(RunFolder(self.out).outcome, text.encode(), sync=False)
         except OSError as error:
-            self.progress.note(f"cannot write {self.out / 'run.json'}: {error.strerror}")
+            self.progress.note(f"cannot write {RunFolder(self.out).outcome}: {error.strerror}")
 
 
 def command_line() -> str:
-    """The command as the user typed it."""
+    """Return the command as the user typed it."""
     return shlex.join(["overfly", *sys.argv[1:]])

@@ -1,7 +1,7 @@
-"""Calls a function for many arguments in processes of their own, each `python -P -m deploy.run.pool`.
+"""Calls a function for many arguments in worker processes, each `python -P -m deploy.run.pool`.
 
-concurrent.futures has a pool too. Its workers import from the current folder, share the terminal's Ctrl-C, and when one
-is killed it does not tell how.
+The workers of concurrent.futures import from the current folder and get the terminal's Ctrl-C, and that pool does not
+report how a worker was killed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from tmc.wire.process import FailedError
 A = TypeVar("A")
 R = TypeVar("R")
 POLL_S = 0.2
-"""Time after which a pool that waits looks whether Ctrl-Z was pressed."""
+"""Interval (s) at which a waiting pool checks for Ctrl-Z."""
 
 
 class Worker:
-    """One process, and the number of the argument that it works on; -1 when it has nothing to do."""
+    """One process. `item`: the index of the argument that it works on; -1 without one."""
 
     def __init__(self) -> None:
         ours, its = socket.socketpair()
@@ -43,8 +43,8 @@ class Worker:
                 pass_fds=[its.fileno()], start_new_session=True,
             )  # fmt: skip
 
-    def give(self, number: int, function: Callable[[Any], Any], argument: Any) -> None:
-        """Have it call `function(argument)`. Raises FailedError when it is dead."""
+    def submit(self, number: int, function: Callable[[Any], Any], argument: Any) -> None:
+        """Let the process call `function(argument)`. Raises FailedError if it has ended."""
         self.item = number
         try:
             self.connection.send((function, argument))
@@ -52,12 +52,12 @@ class Worker:
             raise FailedError(self._how_it_ended()) from None
 
     def outcome(self) -> tuple[bool, Any]:
-        """True and what it returned, or False and what it raised. Raises FailedError when it died."""
+        """Return (True, result) or (False, exception). Raises FailedError if the process has ended."""
         try:
-            good, value = self.connection.recv()
+            succeeded, value = self.connection.recv()
         except (EOFError, OSError):
             raise FailedError(self._how_it_ended()) from None
-        return good, value
+        return succeeded, value
 
     def _how_it_ended(self) -> str:
         how = process.how_it_ended(self.process.wait())
@@ -66,7 +66,7 @@ class Worker:
         return f"a worker process {how}: {reason or 'memory may have run out, so try again with fewer --jobs'}"
 
     def close(self) -> None:
-        """End it, whatever it does."""
+        """Kill the process."""
         self.process.kill()
         self.process.wait()
         self.connection.close()
@@ -76,7 +76,7 @@ class Worker:
 def call_each(function: Callable[[A], R], arguments: Sequence[A], jobs: int) -> Iterator[R]:
     """Yield `function(a)` for each argument in order, computed on `jobs` processes.
 
-    Raises what the function raises, in its turn, and FailedError, which says how, when a process dies.
+    Raises what the function raises, in order, and FailedError, which says how, if a process ends early.
     """
     workers: list[Worker] = []
     suspension = Suspension(lambda: [worker.process.pid for worker in workers])
@@ -86,17 +86,17 @@ def call_each(function: Callable[[A], R], arguments: Sequence[A], jobs: int) -> 
         idle, busy = [*workers], dict[Any, Worker]()
         for number in range(len(arguments)):
             while number not in outcomes:
-                suspension.take()
+                suspension.suspend_if_asked()
                 while idle and (item := next(waiting, None)) is not None:
                     worker = idle.pop()
-                    worker.give(item[0], function, item[1])
+                    worker.submit(item[0], function, item[1])
                     busy[worker.connection] = worker
                 for connection in wait([*busy], POLL_S):
                     worker = busy.pop(connection)
                     outcomes[worker.item] = worker.outcome()
                     idle.append(worker)
-            good, value = outcomes.pop(number)
-            if not good:
+            succeeded, value = outcomes.pop(number)
+            if not succeeded:
                 raise value
             yield value
     finally:
@@ -106,17 +106,17 @@ def call_each(function: Callable[[A], R], arguments: Sequence[A], jobs: int) -> 
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Serve one pool until it closes its side."""
+    """Serve one pool until it closes its side; return the exit code."""
     parser = argparse.ArgumentParser("deploy.run.pool", description=__doc__, allow_abbrev=False)
     parser.add_argument("--pipe", type=int, required=True, help="descriptor of the socket to the pool")
-    parser.add_argument("--parent", type=int, required=True, help="process to die with")
+    parser.add_argument("--parent", type=int, required=True, help="end with this process")
     a = parser.parse_args(argv)
     process.become_child(a.parent)
     return process.run_child(lambda: serve(Connection(a.pipe)), ())
 
 
 def serve(connection: Connection) -> int:
-    """Call what comes in, and send back what it returns or raises."""
+    """Call each (function, argument) received, and send back what it returns or raises."""
     with suppress(EOFError, ConnectionError):
         while True:
             function, argument = connection.recv()

@@ -1,4 +1,4 @@
-"""The folder that a mission's processes share: their sockets, and the track table, in memory where there is room."""
+"""The scratch folder of a mission: sockets and the track table, in memory if there is room."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from tmc.kernel.text import printable
 from tmc.wire.endpoints import FEED, LONGEST_PATH
 
 NAME, HELD = "overfly-", "held"
-"""How the names of these folders begin, and the file in each that is locked while its supervisor incarnations."""
+"""Prefix of the folders' names, and the file in each that is locked while its supervisor runs."""
 MEMORY = Path("/dev/shm")
-"""Memory-backed: the track table must not wait for a disk."""
+"""Memory-backed, because the track table must not wait for a disk."""
 ELSEWHERE = (Path("/tmp"), Path("/var/tmp"))
 
 
 @dataclass(frozen=True)
 class Scratch:
-    """A folder of its own; `held` is locked for as long as it is open. `tracks` is there unless `table` was False."""
+    """A scratch folder. `held`: the file that is locked while it is open. `tracks` exists unless `table` was False."""
 
     folder: Path
     held: IO[bytes]
 
     @property
     def endpoint(self) -> str:
-        """Where the TMC listens for UAVs."""
+        """The endpoint at which the TMC listens for UAVs."""
         return f"ipc://{self.folder}/sync"
 
     @property
     def tracks(self) -> Path:
-        """The track table."""
+        """The path of the track table."""
         return self.folder / "tracks"
 
     def close(self) -> None:
-        """Remove it."""
+        """Remove the folder."""
         with suppress(OSError):
             shutil.rmtree(self.folder)
         self.held.close()
 
 
 def make(config: Config, *, table: bool = True) -> Scratch:
-    """A new folder, with room for the table; raises ConfigError when no folder of this machine has it.
+    """Make a scratch folder with room for the table. Raises ConfigError if no place of this machine has it.
 
-    The folders of supervisors that were killed are removed: no process holds their files any more.
+    Folders of killed supervisors are removed first, since no process locks their files any more.
     """
     team, ticks = config.team.size, config.training.ticks
     wrong = []
@@ -71,7 +71,7 @@ def make(config: Config, *, table: bool = True) -> Scratch:
 
 @contextmanager
 def made(config: Config) -> Iterator[Scratch]:
-    """A folder like that of a mission, removed with the block; raises ConfigError."""
+    """Yield a scratch folder that is removed at the end of the block. Raises ConfigError."""
     scratch = make(config)
     try:
         yield scratch
@@ -80,15 +80,15 @@ def made(config: Config) -> Iterator[Scratch]:
 
 
 def places() -> list[Path]:
-    """Where such a folder may lie, the best first."""
+    """Return the places for scratch folders, the best first."""
     found = [MEMORY]
-    with suppress(OSError):  # no folder for temporary files can be written
+    with suppress(OSError):  # no folder for temporary files is writable
         found.append(Path(tempfile.gettempdir()))
     return [*dict.fromkeys([*found, *ELSEWHERE])]
 
 
 def _made(place: Path, table: tuple[int, int] | None) -> Scratch:
-    """A folder in `place` where all that a mission does there was tried; nothing is left of one that raises OSError."""
+    """Make a folder in `place`, and try all that a mission does there. Raises OSError, and leaves no folder then."""
     folder = Path(tempfile.mkdtemp(prefix=NAME, dir=place))
     try:
         held = (folder / ".new").open("wb")
@@ -121,7 +121,7 @@ def _try_socket(scratch: Scratch) -> None:
 
 
 def _reason(place: Path, error: OSError) -> str:
-    """Why a place will not do; with the free bytes, where it can tell."""
+    """Return why a place cannot be used, with its free bytes if they are known."""
     try:
         free = f", {shutil.disk_usage(place).free:,} bytes free"
     except OSError:

@@ -1,1 +1,1 @@
-"""What verifies a mission: exactness, asynchrony, and chaos."""
+"""Verifies missions: exactness, asynchrony, and chaos."""

@@ -1,4 +1,4 @@
-"""The same mission twice, as processes and in lock step, and every fact of the two compared."""
+"""Flies the same mission as processes and in lock step, and compares every fact of the two."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from tmc.wire import process
 PROCESSES, LOCKSTEP = "processes", "lockstep"
 """Names of the two run folders."""
 STALLS: dict[str, Any] = {"trial.stall": 0.005, "trial.stall_share": 0.02, "trial.stall_spread": 1.0}
-"""Stalls at random: each UAV at one tick in fifty, for up to 10 ms, some dozens of ticks of the others' flight."""
+"""Random stalls: each UAV at one tick in fifty, for up to 10 ms, in which the others fly some dozens of ticks."""
 
 
-class Stopped(Exception):  # noqa: N818  the sentence for the user; the mission has said why
-    """A mission did not come to its end."""
+class MissionAborted(Exception):  # noqa: N818  the sentence for the user; the mission has printed the reason
+    """A mission ended early."""
 
 
-class Quiet(Progress):
-    """Shows no progress of a single mission, only its notes."""
+class NotesOnly(Progress):
+    """Prints the notes of a mission, but no progress."""
 
     def show(self, status: m.Status) -> None: ...
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of comparing two flights of one mission: facts in each, moves flown, wall seconds."""
+    """The result of comparing two flights of one mission: facts in each, moves flown, wall time (s)."""
 
     facts: int
     steps: int
@@ -47,7 +47,7 @@ class Outcome:
 def combinations(
     base: Mapping[str, Any], actors: list[int], scenarios: list[int], periods: list[int], phases: list[str], seeds: int
 ) -> list[Config]:
-    """The config of every combination, each schedule of exchanges once: scenario I and T_u = 1 know no phases."""
+    """Return the config of every combination, each exchange schedule once: scenario I and T_u = 1 have no phases."""
     found: dict[tuple[Any, ...], Config] = {}
     for n, scenario, period, phase in itertools.product(actors, scenarios, periods, phases):
         values = {"team.size": n, "scenario": scenario, "comms.period": period, "comms.phase": phase}
@@ -59,7 +59,7 @@ def combinations(
 
 
 def verify(config: Config, policy: bytes | None, folder: Path) -> Outcome:
-    """Fly a mission both ways in `folder`, which is removed when there is no difference. Raises Stopped."""
+    """Fly a mission both ways in `folder`, which is removed if there is no difference. Raises MissionAborted."""
     start = time.perf_counter()
     facts, reference = fly_both(config, policy, folder)
     difference = compare.first_difference(facts, reference)
@@ -69,9 +69,9 @@ def verify(config: Config, policy: bytes | None, folder: Path) -> Outcome:
 
 
 def fly_both(config: Config, policy: bytes | None, folder: Path) -> tuple[compare.Facts, compare.Facts]:
-    """The facts of a mission flown as processes, and of the same in lock step; the logs stay in `folder`.
+    """Return the facts of a mission flown as processes, and of the same in lock step; the logs stay in `folder`.
 
-    Raises Stopped; of a mission that the user stopped nothing is left.
+    Raises MissionAborted. Removes `folder` if the user stops the mission.
     """
     world = check(build({"trial.observation_hash": True}, config), policy)
     try:
@@ -84,23 +84,23 @@ def fly_both(config: Config, policy: bytes | None, folder: Path) -> tuple[compar
 
 
 def fly(world: World, policy: bytes | None, out: Path, *, in_one_process: bool) -> None:
-    """One flight without a word, unless something is wrong. Raises Stopped when it did not come to its end."""
+    """Fly one mission; print only what is wrong. Raises MissionAborted, or KeyboardInterrupt if the user stops it."""
     out.mkdir(parents=True)
-    quiet = Quiet(world.config, world.law.cells.size, bound_of(world))
-    code = Mission(world, out, command_line(), policy, quiet).run(in_one_process=in_one_process)
+    progress = NotesOnly(world.config, world.law.cells.size, bound_of(world))
+    code = Mission(world, out, command_line(), policy, progress).run(in_one_process=in_one_process)
     if code == process.FAILED:
-        raise Stopped(f"a mission did not come to its end; its logs are in {out}")
+        raise MissionAborted(f"a mission ended early; its logs are in {out}")
     if code != process.DONE:
         raise KeyboardInterrupt
 
 
 def cost(config: Config) -> float:
-    """About how long a mission takes, in moves: its own, and the starts of its processes."""
+    """Estimate how long a mission takes, in moves: its own, and the starts of its processes."""
     return config.team.size * (config.training.ticks * config.training.episodes + 300.0) + 500.0
 
 
-def timed(configs: list[Config]) -> Iterator[tuple[int, Config, float]]:
-    """(number from 1, config, share of all the work that is done before it) of every mission."""
+def with_progress(configs: list[Config]) -> Iterator[tuple[int, Config, float]]:
+    """Yield (number from 1, config, share of all work that is done before it) of every mission."""
     total, done = sum(map(cost, configs)), 0.0
     for number, config in enumerate(configs, 1):
         yield number, config, done / total

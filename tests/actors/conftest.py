@@ -1,4 +1,4 @@
-"""What the UAVs' tests share: a small town, worlds in it, and fleets that fly whole missions."""
+"""Fixtures of the actors' tests: a small town, worlds in it, and fleets that fly whole missions."""
 
 from __future__ import annotations
 

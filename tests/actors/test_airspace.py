@@ -1,4 +1,4 @@
-"""The look-ahead airspace gives what waiting for everything would give, in any interleaving, over table and radio."""
+"""The look-ahead airspace flies as if every UAV waited for all, in any interleaving, over table and radio."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TICKS = 24
 
 @dataclass
 class Plan:
-    """What everybody intends: for each episode the starts, and an action a tick and UAV."""
+    """What all UAVs intend: the starts of each episode, and one action per tick per UAV."""
 
     grid: Grid
     sensing: float
@@ -38,7 +38,7 @@ class Plan:
 
 @dataclass
 class Trace:
-    """What came of it: (episode, tick, uav) -> cell, cells of sensed peers, and whether the move was blocked."""
+    """What was flown: (episode, tick, uav) -> cell, cells of sensed peers, and whether the move was blocked."""
 
     cell: dict[tuple[int, int, int], int] = field(default_factory=dict)
     seen: dict[tuple[int, int, int], list[int]] = field(default_factory=dict)
@@ -62,7 +62,7 @@ def plans(draw: st.DrawFn) -> Plan:
 
 
 def target(plan: Plan, cell: int, action: int) -> int:
-    """Where an action leads; -1 is the action that leads nearest to the middle. Off the grid: the cell itself."""
+    """Return where an action leads: the cell itself if off the grid. -1 is the action that leads nearest the middle."""
     options = plan.grid.target_lists[cell]
     if action >= 0:
         return options[action] if options[action] >= 0 else cell
@@ -71,7 +71,7 @@ def target(plan: Plan, cell: int, action: int) -> int:
 
 
 def reference(plan: Plan) -> Trace:
-    """Brute force: everybody waits for everything, tick by tick, in ascending id."""
+    """Fly by brute force: every UAV waits for all others, tick by tick, in ascending id."""
     trace, cols = Trace(), plan.grid.cols
     for e, starts in enumerate(plan.starts):
         cells = list(starts)
@@ -92,7 +92,7 @@ def reference(plan: Plan) -> Trace:
 
 
 class Flyer:
-    """One UAV of a plan: begins, senses, moves, as far as its airspace lets it."""
+    """One UAV of a plan: starts episodes, senses and moves, as far as its airspace lets it."""
 
     def __init__(self, plan: Plan, i: int, tracks: Tracks, trace: Trace) -> None:
         self.plan, self.i, self.trace = plan, i, trace
@@ -105,7 +105,7 @@ class Flyer:
         return self.episode == len(self.plan.starts)
 
     def step(self) -> bool:
-        """One thing; False when it must wait for a peer."""
+        """Take one step; return False when it must wait for a peer."""
         self.waits = None
         try:
             getattr(self, f"_{self.stage}")()
@@ -117,7 +117,7 @@ class Flyer:
     def _begin(self) -> None:
         starts = self.plan.starts[self.episode]
         self.t, self.cell, self.stage = 0, starts[self.i], "sense"
-        self.airspace.begin(self.episode + 1, starts)
+        self.airspace.start_episode(self.episode + 1, starts)
         self.airspace.tracks.publish(0, self.cell)
 
     def _sense(self) -> None:
@@ -130,14 +130,14 @@ class Flyer:
 
     def _move(self) -> None:
         goal = target(self.plan, self.cell, self.plan.actions[self.episode][self.t][self.i])
-        held = self.airspace.held(self.t, self.cell, goal)
+        held = self.airspace.is_held(self.t, self.cell, goal)
         self.trace.held[self.episode, self.t, self.i] = held
         self.t, self.cell, self.stage = self.t + 1, self.cell if held else goal, "sense"
         self.airspace.tracks.publish(self.t, self.cell)
 
 
 def fly(flyers: list[Flyer], rng: Random, air: Callable[[], bool], silence: Callable[[], None]) -> None:
-    """Let flyers and the air take steps in random order; `silence` when nobody can. Episodes begin together."""
+    """Let flyers and the radio take steps in random order; call `silence` when none can. Episodes start together."""
     stuck: set[int] = set()
     quiet = 0
     while not all(f.finished for f in flyers):
@@ -196,19 +196,19 @@ class Air:
         if not full:
             return False
         key = self.rng.choice(full)
-        self.radios[key[1]].hear(self.queues[key].popleft())
+        self.radios[key[1]].on_beacon(self.queues[key].popleft())
         return True
 
     def ask(self) -> None:
         for flyer, radio in zip(self.flyers, self.radios, strict=True):
             if flyer.waits is not None:
-                radio.ask(flyer.waits.peer)
+                radio.request_track(flyer.waits.peer)
 
 
 @settings(max_examples=40, deadline=None)
 @given(plan=plans(), seed=st.integers(0, 2**32))
-def test_over_radio_whoever_waits_is_told(plan: Plan, seed: int) -> None:
-    """Beacons arrive late but in order: nobody ever has to ask."""
+def test_over_radio_a_uav_that_waits_gets_a_beacon(plan: Plan, seed: int) -> None:
+    """Beacons arrive late but in order, so no UAV ever has to request a track."""
     air = Air(plan, Random(seed), lost=0.0)
     fly(air.flyers, air.rng, air.deliver, nobody)
     assert air.trace == reference(plan)
@@ -216,14 +216,14 @@ def test_over_radio_whoever_waits_is_told(plan: Plan, seed: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(plan=plans(), seed=st.integers(0, 2**32), lost=st.sampled_from([0.05, 0.3, 0.7]))
-def test_over_radio_with_lost_beacons_the_one_that_waits_asks(plan: Plan, seed: int, lost: float) -> None:
+def test_over_radio_with_lost_beacons_the_waiting_uav_requests_the_track(plan: Plan, seed: int, lost: float) -> None:
     air = Air(plan, Random(seed), lost)
     fly(air.flyers, air.rng, air.deliver, air.ask)
     assert air.trace == reference(plan)
 
 
 def test_two_that_fly_towards_each_other_over_radio() -> None:
-    """The first is far ahead when the other hears of it, so its newest cell says little of where it was."""
+    """The first is far ahead when its beacon arrives, so its newest cell says little about where it was."""
     grid = Grid(1, 40)
     starts = [[0, 39]]
     east, west = 3, 2
@@ -238,7 +238,7 @@ def test_two_that_fly_towards_each_other_over_radio() -> None:
     assert air.trace == reference(plan)
 
 
-def test_far_from_each_other_nobody_waits_and_nothing_is_sent() -> None:
+def test_far_from_each_other_no_uav_waits_and_nothing_is_sent() -> None:
     grid = Grid(30, 30)
     plan = Plan(grid, 1.5, [[0, 899]], [[[8, 8]] * TICKS])
     air = Air(plan, Random(0), lost=0.0)
@@ -252,7 +252,7 @@ def test_far_from_each_other_nobody_waits_and_nothing_is_sent() -> None:
 def test_waiting_names_the_peer_and_the_tick() -> None:
     table = TrackTable(3, 10)
     airspace = Airspace(0, 3, Grid(9, 9), 1.5, TableTracks(table, 0))
-    airspace.begin(1, [0, 80, 2])
+    airspace.start_episode(1, [0, 80, 2])
     with pytest.raises(Waiting, match="waiting for UAV 2 at tick 1") as waiting:
         airspace.sense(1, 1)
     assert (waiting.value.peer, waiting.value.tick) == (2, 1)
@@ -260,42 +260,42 @@ def test_waiting_names_the_peer_and_the_tick() -> None:
 
 def test_to_stay_is_never_held() -> None:
     airspace = Airspace(1, 3, Grid(3, 3), 1.5, TableTracks(TrackTable(3, 10), 1))
-    airspace.begin(1, [0, 1, 2])
-    assert airspace.held(0, 1, 1) is False  # without waiting for anybody
+    airspace.start_episode(1, [0, 1, 2])
+    assert airspace.is_held(0, 1, 1) is False  # without waiting for a peer
 
 
 def test_a_beacon_that_cannot_be_changes_nothing() -> None:
     said: list[Beacon] = []
     radio = RadioTracks(0, 2, Grid(3, 3), 1.5, said.append)
-    radio.begin(2, [0, 8])
+    radio.start_episode(2, [0, 8])
     none = np.zeros(0, "<u2")
     for uav, episode, cell in ((0, 2, 5), (2, 2, 5), (60_000, 2, 5), (1, 1, 5), (1, 2, 9), (1, 2, 65_535)):
-        radio.hear(Beacon(uav, episode, 1, np.array([cell], "<u2"), none))
+        radio.on_beacon(Beacon(uav, episode, 1, np.array([cell], "<u2"), none))
         assert radio.newest(1) == (0, 8) and radio.newest(0) == (0, 0) and radio.at(1, 1) == -1
     assert said == []
-    radio.hear(Beacon(1, 2, 1, np.array([7, 6], "<u2"), none))
+    radio.on_beacon(Beacon(1, 2, 1, np.array([7, 6], "<u2"), none))
     assert radio.newest(1) == (2, 6) and [radio.at(1, t) for t in range(4)] == [8, 7, 6, -1]
 
 
 def test_a_beacon_of_the_next_episode_is_kept_until_it_begins() -> None:
     radio = RadioTracks(0, 2, Grid(3, 3), 1.5, lambda _: None)
     early = Beacon(1, 1, 1, np.array([5], "<u2"), np.zeros(0, "<u2"))
-    radio.hear(early)
-    radio.begin(1, [0, 8])
+    radio.on_beacon(early)
+    radio.start_episode(1, [0, 8])
     assert radio.newest(1) == (1, 5)
-    radio.begin(2, [0, 7])
+    radio.start_episode(2, [0, 7])
     assert radio.newest(1) == (0, 7)
 
 
-def test_who_is_lost_is_told_no_more() -> None:
-    """Its track stands still, so that by the rule each of this UAV's positions could matter to it."""
+def test_a_lost_uav_gets_no_more_beacons() -> None:
+    """Its track no longer grows, so by the rule each of this UAV's positions could matter to it."""
     said: list[Beacon] = []
     airspace = Airspace(0, 3, Grid(3, 3), 1.5, RadioTracks(0, 3, Grid(3, 3), 1.5, said.append))
-    airspace.begin(1, [0, 2, 8])
-    airspace.lose(2)
+    airspace.start_episode(1, [0, 2, 8])
+    airspace.drop_peer(2)
     for tick, cell in enumerate([1, 4, 1, 0], 1):
         airspace.tracks.publish(tick, cell)
     assert said and all(beacon.to.tolist() == [1] for beacon in said)
-    airspace.begin(2, [0, 2, 8])
+    airspace.start_episode(2, [0, 2, 8])
     airspace.tracks.publish(1, 4)
     assert 2 in said[-1].to.tolist() + said[-2].to.tolist()

@@ -20,7 +20,7 @@ MISSIONS = [
 
 @pytest.mark.parametrize("where", ["town", "toronto"])
 @pytest.mark.parametrize(("planner", "size", "scenario"), MISSIONS)
-def test_the_laws_of_flight(
+def test_the_rules_of_flight(
     flown: Callable[[World], Any], world_of: Callable[..., World], request: pytest.FixtureRequest, where: str,
     planner: str, size: int, scenario: int,
 ) -> None:  # fmt: skip
@@ -61,7 +61,7 @@ def test_every_episode_is_flown(flown: Callable[[World], Any], world_of: Callabl
 def test_greedy_beats_random_flight(
     flown: Callable[[World], Any], world_of: Callable[..., World], toronto: RoadMap
 ) -> None:
-    """A planner that looks at its map keeps the city better known than one that does not."""
+    """A planner that uses its map keeps the uncertainty lower than one that does not."""
     mean = {}
     for planner in ("random", "random-road", "greedy"):
         values = {

@@ -1,4 +1,4 @@
-"""A policy file from elsewhere: what it declares is checked before a flight, and each value that it gives in flight."""
+"""A policy file from elsewhere: its declarations are checked before a flight, each of its values in flight."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def model_of(
     card: dict[str, Any] | None = None,
     opset: int = 17,
 ) -> bytes:
-    """A model of these nodes under the card of the world, or what a test wants in the place of either."""
+    """Return a model of these nodes with the card of the world, or with what a test replaces either by."""
     inputs = [helper.make_tensor_value_info(INPUT, types[0], takes), *more_inputs]
     outputs = [helper.make_tensor_value_info(OUTPUT, types[1], gives)]
     tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in (weights or {}).items()]
@@ -59,7 +59,7 @@ def model_of(
 
 
 def linear(weights: np.ndarray[Any, Any] | None = None, before: tuple[Any, ...] = (), x: str = INPUT) -> dict[str, Any]:
-    """Nodes and weights of a policy that is linear in `x`."""
+    """Return nodes and weights of a policy that is linear in `x`."""
     table = np.zeros((27, 9), np.float32) if weights is None else weights
     nodes = [*before, helper.make_node("Flatten", [x], ["flat"]), helper.make_node("MatMul", ["flat", "w"], [OUTPUT])]
     return {"nodes": nodes, "weights": {"w": table.astype(np.float32)}}
@@ -160,7 +160,7 @@ def test_a_policy_that_draws_at_random_is_refused(world: World) -> None:
 
 
 def test_a_policy_that_does_not_look_flies(world: World) -> None:
-    """Its values are there before it is asked; they must reach us all the same."""
+    """Its values do not depend on the input, and must be returned all the same."""
     values = np.arange(9, dtype=np.float32)[None]
     nodes = [helper.make_node("Constant", [], [OUTPUT], value=numpy_helper.from_array(values))]
     assert controller(model_of(world, nodes, gives=(1, 9)), world).choose(state(world)) == 8
@@ -170,14 +170,14 @@ def test_a_policy_that_does_not_look_flies(world: World) -> None:
 
 
 def only_positions() -> tuple[Any, ...]:
-    """Of the observation, the channel of positions alone."""
+    """Return the nodes that select the channel of positions of the observation."""
     return (helper.make_node("Slice", [INPUT, "from", "to", "along"], ["p"]),)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("action", [0, 4, 8])
 def test_a_value_that_is_not_finite_stops_the_flight(world: World, bad: float, action: int) -> None:
-    """Wherever it stands among the nine, and also where another one is chosen."""
+    """At any place among the nine, and also when another action is chosen."""
     values = np.arange(9, dtype=np.float32)[None]
     values[0, action] = bad
     nodes = [helper.make_node("Constant", [], [OUTPUT], value=numpy_helper.from_array(values))]
@@ -195,7 +195,7 @@ def test_values_whose_sum_is_beyond_float32_are_finite(world: World) -> None:
 
 
 def test_a_policy_that_fails_only_on_what_it_sees_is_stopped_there(world: World) -> None:
-    """log(1.25 - sum of P): a number with the UAV alone in state (1.0), none with a peer beside it (1.5)."""
+    """log(1.25 - sum of P): finite with the UAV alone in the observation (1.0), NaN with a peer beside it (1.5)."""
     table = np.ones((1, 9))
     before = (
         *only_positions(),
@@ -217,7 +217,7 @@ def test_a_policy_that_fails_only_on_what_it_sees_is_stopped_there(world: World)
 
 
 def test_a_policy_that_fails_only_on_what_it_never_sees_flies(world: World) -> None:
-    """0 / 0 on an image of zeros: there is always the UAV itself in it."""
+    """0 / 0 happens only on an image of zeros, and the UAV itself is always in the image."""
     table = np.zeros((27, 9))
     table[:9, 5] = 1.0  # the channel of positions
     made = linear(table, (*only_positions(), helper.make_node("ReduceSum", ["p", "axes"], ["sum"]),
@@ -230,7 +230,7 @@ def test_a_policy_that_fails_only_on_what_it_never_sees_flies(world: World) -> N
 
 
 def test_a_model_that_cannot_be_run_on_what_it_sees(world: World) -> None:
-    """It asks for row 2 x U of a table of two rows: there with U = 0.5, not with U = 1."""
+    """It gathers row 2 x U of a table of two rows, which exists for U = 0.5 and not for U = 1."""
     nodes = [
         helper.make_node("Slice", [INPUT, "from", "to", "along"], ["u"]),
         helper.make_node("ReduceMax", ["u"], ["most"], axes=[1, 2, 3], keepdims=0),
@@ -319,7 +319,7 @@ def rename(model: Any) -> None:
     ],
     ids=["IR", "opset", "operator", "no nodes"],
 )
-def test_the_reason_of_the_library_is_told(world: World, make: Callable[[World], bytes], words: str) -> None:
+def test_the_reason_of_the_library_is_given(world: World, make: Callable[[World], bytes], words: str) -> None:
     text = refused(make(world), world)
     assert words in text and "onnxruntime_src" not in text and "[ONNXRuntimeError]" not in text
     assert f"ONNX Runtime {ort.__version__} cannot use the model" in text

@@ -1,4 +1,4 @@
-"""What a UAV decides by, as a hash: it changes with all that is seen, and with nothing else."""
+"""The hash of what a UAV decides by: it changes with all that is observed, and with nothing else."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_one_hash_a_move_and_none_where_chance_chose(observer: ObservationBuilde
     assert hasher.hashes_for(record(5, 6)).hashes == [seen, 0]
 
 
-def test_what_a_policy_says_of_its_moves_is_not_a_decision(observer: ObservationBuilder, state: LocalState) -> None:
+def test_q_of_a_move_is_not_a_decision(observer: ObservationBuilder, state: LocalState) -> None:
     hasher = ObservationHasher(observer)
     watched = hasher.watch(North())
     assert isinstance(watched, QController) and watched.q_of(state, 4) == (4.0, 9.0)

@@ -24,7 +24,7 @@ STREET = "####"
 
 
 class Script:
-    """Does as it is told, and notes what it saw."""
+    """Chooses by a script, and keeps the states that it saw."""
 
     def __init__(self, actions: list[int]) -> None:
         self.actions, self.sights = iter(actions), list[LocalState]()
@@ -35,7 +35,7 @@ class Script:
 
 
 class Team:
-    """Pilots with scripts, in an episode whose starts are as wanted; the test is the TMC, and answers with nothing."""
+    """Pilots with scripts, in an episode with the wanted starts; the test is the TMC, whose answers are empty."""
 
     def __init__(self, world: World, starts: list[int], scripts: list[list[int]]) -> None:
         self.world, self.T = world, world.config.training.ticks
@@ -47,11 +47,11 @@ class Team:
             for i, script in enumerate(self.scripts)
         ]
         for i, pilot in enumerate(self.pilots):
-            pilot.begin(begin(world, self.episode, starts[i]))
+            pilot.on_begin(begin(world, self.episode, starts[i]))
         self.records: list[list[Record]] = [[] for _ in starts]
 
     def fly(self) -> Team:
-        """Everybody, to the end of the episode."""
+        """Fly all pilots to the end of the episode."""
         for _ in range(10 * self.T):
             for pilot, records in zip(self.pilots, self.records, strict=True):
                 try:
@@ -83,7 +83,7 @@ def answer(world: World, episode: int, tick: int, **fields: Any) -> Map:
 
 @pytest.fixture
 def team(world_of: Callable[..., World]) -> Callable[..., Team]:
-    """`raster`, the starts, an action list a UAV, and other settings."""
+    """Return a maker of teams: `raster`, the starts, one list of actions per UAV, and other settings."""
 
     def make(raster: str, starts: list[int], scripts: list[list[int]], **values: Any) -> Team:
         settings = {"team.size": len(starts), "training.ticks": len(scripts[0]), "comms.period": 1000}
@@ -96,16 +96,16 @@ def u(age: int) -> float:
     return float(np.float32(5 * (1 - np.exp(-0.01 * age))))
 
 
-def test_a_flight_taken_up_at_its_end_asks_nobody_where_it_was(world_of: Callable[..., World]) -> None:
-    """The TMC has all of it; the peers may have begun the next episode, and answer for that one only."""
+def test_a_flight_resumed_at_its_end_waits_for_no_peer(world_of: Callable[..., World]) -> None:
+    """The TMC has all of it, and the peers may be in the next episode already."""
     world = world_of({"team.size": 2, "training.ticks": 3, "comms.period": 1000}, STREET)
     episode = next(e for e in range(1, 1000) if world.starts(e) == [0, 1])
     pilot = Pilot(world, 0, 2, TableTracks(TrackTable(2, 3), 0), ObservationBuilder(world), Policies(), Script([]))
-    pilot.begin(begin(world, episode, 0, 0, 0, 0, shipped=3, sequence=2))
+    pilot.on_begin(begin(world, episode, 0, 0, 0, 0, shipped=3, sequence=2))
     assert pilot.advance() is None and pilot.phase is Phase.IDLE
     pilot.on_map(answer(world, episode, 3))
     assert pilot.advance() is None and pilot.phase is Phase.IDLE
-    pilot.begin(begin(world, episode + 1, world.starts(episode + 1)[0]))
+    pilot.on_begin(begin(world, episode + 1, world.starts(episode + 1)[0]))
     assert pilot.phase is Phase.SENSE
 
 
@@ -219,17 +219,17 @@ def test_a_repeated_begin_changes_nothing(team: Callable[..., Team]) -> None:
     pilot.advance()
     pilot.on_map(answer(made.world, made.episode, 0))
     pilot.advance()
-    assert pilot.begin(begin(made.world, made.episode, 0)) is None
+    assert pilot.on_begin(begin(made.world, made.episode, 0)) is None
     assert (pilot.t, pilot.phase, pilot.sequence) == (4, Phase.MAP, 2)
 
 
-def test_a_flight_is_taken_up_where_the_last_record_ends(team: Callable[..., Team]) -> None:
+def test_a_flight_is_resumed_where_the_last_record_ends(team: Callable[..., Team]) -> None:
     made = team(STREET, [0], [[W_, E_, STAY, STAY]], **{"comms.period": 2, "training.ticks": 6})
     pilot = made.pilots[0]
     pilot.phase, pilot.episode = Phase.IDLE, 0  # a new process knows nothing
     known = np.array([0, 1, 2, 0], "<u2")
     begun = begin(made.world, made.episode, 0, 1, 2, shipped=2, sequence=2, version=5, last_visit=known)
-    pilot.begin(begun)
+    pilot.on_begin(begun)
     assert (pilot.t, pilot.cell, pilot.previous) == (2, 2, 1)
     assert pilot.advance() is None and pilot.phase is Phase.MAP  # the TMC has this tick: nothing is shipped twice
     pilot.on_map(answer(made.world, made.episode, 2))
@@ -244,7 +244,7 @@ def test_a_flight_is_taken_up_where_the_last_record_ends(team: Callable[..., Tea
 
 
 class Policies:
-    """Makes deciders of policy bytes, and remembers them."""
+    """Makes controllers of policy bytes, and keeps the bytes."""
 
     def __init__(self) -> None:
         self.made: list[bytes] = []
@@ -264,7 +264,7 @@ def learning(world_of: Callable[..., World], **values: Any) -> tuple[Pilot, Poli
 def test_a_policy_is_fetched_at_an_exchange_and_nowhere_else(world_of: Callable[..., World]) -> None:
     pilot, policies, world = learning(world_of)
     start = world.starts(1)[0]
-    assert pilot.begin(begin(world, 1, start, policy=3)) == PolicyRequest(3)
+    assert pilot.on_begin(begin(world, 1, start, policy=3)) == PolicyRequest(3)
     assert pilot.advance() is None and pilot.phase is Phase.POLICY
     pilot.on_policy(Policy(2, b"two"))
     assert pilot.phase is Phase.POLICY and policies.made == []
@@ -272,7 +272,7 @@ def test_a_policy_is_fetched_at_an_exchange_and_nowhere_else(world_of: Callable[
     record = pilot.advance()
     assert record is not None and (record.policy, policies.made) == (3, [b"three"])
     assert pilot.on_map(answer(world, 1, 0, policy=3)) is None
-    pilot.on_policy(Policy(4, b"four"))  # nobody asked
+    pilot.on_policy(Policy(4, b"four"))  # not requested
     record = pilot.advance()
     assert record is not None and (record.tick, record.policy, policies.made) == (10, 3, [b"three"])
     assert pilot.on_map(answer(world, 1, 10, policy=5)) == PolicyRequest(5)
@@ -282,15 +282,15 @@ def test_a_policy_is_fetched_at_an_exchange_and_nowhere_else(world_of: Callable[
 
 @pytest.mark.parametrize("mask", [False, True])
 def test_exploration_is_addressed(world_of: Callable[..., World], mask: bool) -> None:
-    """Tick t of an episode explores, and how, by two numbers that anybody can draw again."""
+    """Whether and how tick t of an episode explores follows from two numbers that can be drawn again."""
     values = {"exploration.start": 0.3, "exploration.end": 0.3, "exploration.mask_blocked": mask, "training.seed": 42}
     pilot, _, world = learning(world_of, **values, **{"comms.period": 1000})
-    pilot.begin(begin(world, 7, world.starts(7)[0], policy=1))
+    pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=1))
     pilot.on_policy(Policy(1, b""))
     pilot.advance()
     pilot.on_map(answer(world, 7, 0, policy=1))
     while (record := pilot.advance()) is None:
-        assert pilot.under_way  # it looks up now and then
+        assert pilot.under_way  # `advance` returns now and then
     assert record.tick == 500
     draws = uniforms(42, Stream.EXPLORATION, 1000, episode=7, uav=0).reshape(500, 2).tolist()
     cells = [world.starts(7)[0], *record.cells.tolist()]
@@ -305,7 +305,7 @@ def test_exploration_is_addressed(world_of: Callable[..., World], mask: bool) ->
 
 
 class Worthy(Script):
-    """A script that says what an action is worth: its number, and 8 for the best."""
+    """A script with Q values: the number of the action, and 8 for the best."""
 
     best = 8.0
 
@@ -313,13 +313,13 @@ class Worthy(Script):
         return float(action), self.best
 
 
-def test_each_move_is_told_with_its_worth_where_priorities_are_on(world_of: Callable[..., World]) -> None:
+def test_records_carry_q_of_each_move_where_priorities_are_on(world_of: Callable[..., World]) -> None:
     """Whether exploration chose it or not."""
     values = {"exploration.start": 0.5, "exploration.end": 0.5, "comms.period": 30, "replay.priority_exponent": 0.6}
     pilot, _, world = learning(world_of, **values)
     policy = Worthy([STAY] * 1000)
     pilot._make_controller = lambda _: policy
-    pilot.begin(begin(world, 7, world.starts(7)[0], policy=1))
+    pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=1))
     pilot.on_policy(Policy(1, b""))
     record = pilot.advance()
     assert record is not None and record.values.size == 0  # no move yet
@@ -335,7 +335,7 @@ def test_each_move_is_told_with_its_worth_where_priorities_are_on(world_of: Call
 def test_a_policy_that_fails_in_flight_names_uav_tick_and_policy(
     world_of: Callable[..., World], explores: float
 ) -> None:
-    """Also where exploration chooses and the policy only says what that is worth."""
+    """Also where exploration chooses and only Q of the move is computed."""
     values = {"exploration.start": explores, "exploration.end": explores, "replay.priority_exponent": 0.6}
     pilot, _, world = learning(world_of, **values)
 
@@ -352,7 +352,7 @@ def test_a_policy_that_fails_in_flight_names_uav_tick_and_policy(
             return 0
 
     pilot._make_controller = lambda _: Failing([STAY] * 1000)
-    pilot.begin(begin(world, 7, world.starts(7)[0], policy=5))
+    pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=5))
     pilot.on_policy(Policy(5, b""))
     pilot.advance()
     pilot.on_map(answer(world, 7, 0, policy=5))
@@ -368,7 +368,7 @@ def test_a_policy_that_cannot_fly_is_named_where_it_is_refused(world_of: Callabl
         raise PolicyError("the file is empty: copy it again")
 
     pilot._make_controller = refuse
-    pilot.begin(begin(world, 7, world.starts(7)[0], policy=5))
+    pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=5))
     with pytest.raises(PolicyError, match="UAV 0 cannot fly policy 5: the file is empty"):
         pilot.on_policy(Policy(5, b""))
 

@@ -32,7 +32,7 @@ def sight_at(world: World, cell: int, peers: list[int], u: Any, draw: float, pre
 
 @st.composite
 def sights(draw: st.DrawFn) -> LocalState:
-    """On the built-in map, with peers around; few different values in the map, so that ties are common."""
+    """Return states on the built-in map, with peers around, and few different values so that ties are common."""
     cell = draw(st.sampled_from(TORONTO.start_cells.tolist()))
     around = [k for k in TORONTO.grid.target_lists[cell][:STAY] if k >= 0]
     peers = draw(st.lists(st.sampled_from(around), max_size=8, unique=True))
@@ -93,7 +93,7 @@ def test_random_takes_any_of_nine_blocked_or_not(draw: float) -> None:
 
 @pytest.mark.parametrize("name", list(PLANNERS))
 def test_the_draw_reaches_every_choice_equally(name: str, town: RoadMap, world_of: Callable[..., World]) -> None:
-    """With nothing to choose by, all choices have the same share of [0, 1)."""
+    """If all choices are equally good, each has the same share of [0, 1)."""
     world = world_of({}, "#####\n#####\n#####")
     u = np.zeros(world.law.cells.size)
     chosen = [

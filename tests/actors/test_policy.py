@@ -37,7 +37,7 @@ def one_thread() -> Iterator[None]:
 
 
 def policy(config: Config, grid: Grid, change: Callable[[Any], None] = lambda net: None, **card: Any) -> bytes:
-    """A policy for these settings, its network changed, and its description too."""
+    """Return a policy for these settings, with changes to its network and to its card."""
     net = qnet.build(config, view_shape(config, grid))
     with torch.no_grad():
         change(net)
@@ -50,7 +50,7 @@ def world(town: RoadMap) -> World:
 
 
 def refused(model: bytes, world: World) -> str:
-    """The one sentence of the refusal."""
+    """Return the sentence of the refusal."""
     with pytest.raises(PolicyError) as error:
         PolicyController(model, world.config, ObservationBuilder(world))
     text = str(error.value)

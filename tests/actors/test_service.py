@@ -1,4 +1,4 @@
-"""The UAV's process: what it does before it knows its mission."""
+"""The UAV's process, before it knows its mission and while it waits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zmq
 
-from actors.service import Left, Service, another_mission
+from actors.service import FlightEnded, Service, belongs_to_another_run
 from tests.command import PATIENCE_S
 from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.world import World
@@ -24,7 +24,7 @@ from tmc.wire import process, sockets
 from tmc.wire.codec import decode
 
 
-def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path, short: Path) -> None:
+def test_a_mission_that_is_over_ends_a_new_process(tmp_path: Path, short: Path) -> None:
     endpoint, context = f"ipc://{short}/sync", zmq.Context[Any]()
     tmc, service = sockets.router(context, endpoint), Service(0, endpoint, tmp_path / "R")
     try:
@@ -34,7 +34,7 @@ def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path, short: 
             frames = sockets.receive(tmc)
             assert frames is not None
             sockets.send(tmc, m.End("the mission is over"), bytes(frames[0]))
-            with pytest.raises(Left, match="over") as left:
+            with pytest.raises(FlightEnded, match="over") as left:
                 joining.result(PATIENCE_S)
             assert left.value.code == process.DONE
     finally:
@@ -42,8 +42,8 @@ def test_a_mission_that_is_over_sends_a_new_process_home(tmp_path: Path, short: 
         context.destroy(linger=0)
 
 
-def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path: Path, short: Path) -> None:
-    """UAV 0 waits for UAV 1, of which nothing comes, while beacons of UAV 2 come in all the time."""
+def test_beacons_of_others_do_not_keep_a_uav_from_requesting_and_resending(tmp_path: Path, short: Path) -> None:
+    """UAV 0 waits for UAV 1, which sends nothing, while beacons of UAV 2 keep arriving."""
     world = World(build({"team.size": 3, "team.controller": "planner:greedy", "training.ticks": 100}))
     numbered = ((e, world.starts(e)) for e in range(1, 5000))
     episode, starts = next((e, s) for e, s in numbered if world.grid.chebyshev(s[0], s[1]) <= 2)
@@ -72,7 +72,7 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
                 elif isinstance(message, m.Record):
                     sockets.send(tmc, m.Map(episode, 0, 1, 0, 0, 0, zeros, m.EMPTY), bytes(identity))
             over.set()
-            with pytest.raises(Left):
+            with pytest.raises(FlightEnded):
                 flying.result(PATIENCE_S)
         assert said["ask"] >= 5 and said["Alive"] >= 2, said
     finally:
@@ -80,10 +80,10 @@ def test_the_beacons_of_others_keep_no_uav_from_asking_and_being_heard(tmp_path:
         context.destroy(linger=0)
 
 
-def test_the_log_of_another_mission_is_not_gone_on_with(tmp_path: Path) -> None:
+def test_the_log_of_another_mission_is_not_resumed(tmp_path: Path) -> None:
     path = tmp_path / "uav-000.mcap"
-    assert not another_mission(path, "a")
+    assert not belongs_to_another_run(path, "a")
     LogWriter(path, "uav-000", JournalConfig(), {"run": "a"}).close()
-    assert not another_mission(path, "a") and another_mission(path, "b")
+    assert not belongs_to_another_run(path, "a") and belongs_to_another_run(path, "b")
     path.rename(tmp_path / "uav-000.mcap.active")
-    assert another_mission(path, "b")
+    assert belongs_to_another_run(path, "b")

@@ -18,7 +18,8 @@ from tests.command import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("actors", "learner", "tmc", "deploy")
-SOURCES = sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+FACE = Path("overfly.py")
+SOURCES = [FACE, *sorted(path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))]
 
 # Package -> the only files that may import it, anywhere in their text.
 HOMES: dict[str, tuple[str, ...]] = {
@@ -68,6 +69,24 @@ def test_the_contracts_of_pyproject_hold() -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
+def modules_imported(path: Path) -> Iterator[str]:
+    """Modules that a file imports, within functions as well; of `from a import b` both a and a.b."""
+    for node in ast.walk(ast.parse((ROOT / path).read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_the_face_stands_between_the_commands_and_all_else() -> None:
+    """It imports nothing that is built on it, and of `learner` nothing: deploy knows where that is needed."""
+    above = ("deploy.commands", "deploy.cli", "deploy.entry", "learner")
+    assert not [name for name in modules_imported(FACE) if name.startswith(above)]
+    users = {path.as_posix() for path in SOURCES if "overfly" in imported(path)}
+    assert users == {f"deploy/commands/{command}.py" for command in ("run", "fly", "evaluate")}
+
+
 @pytest.mark.parametrize("package", HOMES)
 def test_a_package_is_imported_only_where_it_belongs(package: str) -> None:
     users = [path.as_posix() for path in SOURCES if package in imported(path)]
@@ -95,6 +114,10 @@ def test_the_tmc_loads_no_network_library() -> None:
 
 def test_the_command_loads_nothing_heavy_before_a_command_is_chosen() -> None:
     assert loaded_after("deploy.cli") == set()
+
+
+def test_the_face_loads_nothing_heavy_before_it_is_used() -> None:
+    assert loaded_after("overfly") == set()
 
 
 @pytest.mark.parametrize("role", ["actors", "tmc"])

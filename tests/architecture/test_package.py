@@ -14,6 +14,7 @@ from tests.command import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"actors", "learner", "tmc", "deploy"}
+FACE = "overfly.py"
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +53,16 @@ def overfly(installed: Path, where: Path, *args: str) -> subprocess.CompletedPro
     )
 
 
-def test_the_wheel_holds_the_four_packages_and_no_tests(contents: set[str]) -> None:
+def test_the_wheel_holds_the_four_packages_the_module_and_no_tests(contents: set[str]) -> None:
     folders = {name.partition("/")[0] for name in contents}
-    assert {name for name in folders if not name.endswith(".dist-info")} == PACKAGES
+    assert {name for name in folders if not name.endswith(".dist-info")} == PACKAGES | {FACE}
     assert not [name for name in contents if "test" in name or name.endswith(".pyc")]
 
 
 def test_the_wheel_holds_every_file_of_the_packages(contents: set[str]) -> None:
     files = (path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file())
     ours = {path.relative_to(ROOT).as_posix() for path in files if "__pycache__" not in path.parts}
-    assert ours == {name for name in contents if ".dist-info/" not in name}
+    assert ours | {FACE} == {name for name in contents if ".dist-info/" not in name}
 
 
 def test_the_wheel_holds_what_is_no_code(contents: set[str]) -> None:
@@ -91,6 +92,28 @@ def test_the_installed_command_flies(installed: Path, tmp_path: Path) -> None:
     flown = overfly(installed, tmp_path, "fly", "planner:greedy", *options)
     assert flown.returncode == 0, flown.stderr
     assert (run / "tmc.mcap").is_file()
+
+
+def test_the_installed_module_flies(installed: Path, tmp_path: Path) -> None:
+    code = 'import overfly\nprint(overfly.__file__, overfly.fly("planner:greedy", actors=2, ticks=30).moves(1).shape)'
+    result = subprocess.run(
+        [sys.executable, "-P", "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)},
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert result.stdout == f"{installed / FACE} (31, 2)\n", result.stderr
+
+
+def test_mypy_sees_the_types_of_the_module(installed: Path, tmp_path: Path) -> None:
+    """When it is told to, as docs/python.md says: a single module has no place for py.typed."""
+    (tmp_path / "user.py").write_text("import overfly\nreveal_type(overfly.fly('x').moves(1))\noverfly.tarin()\n")
+    (tmp_path / "mypy.ini").write_text("[mypy]\nstrict = true\n[mypy-overfly]\nfollow_untyped_imports = true\n")
+    result = subprocess.run(
+        [sys.executable, "-P", "-m", "mypy", "--cache-dir", os.devnull, "user.py"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)},
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    lines = [line for line in result.stdout.splitlines() if line.startswith("user.py")]
+    assert len(lines) == 2 and "ndarray[" in lines[0] and 'has no attribute "tarin"' in lines[1], result.stdout
 
 
 def test_the_packages_come_from_the_wheel(installed: Path, tmp_path: Path) -> None:

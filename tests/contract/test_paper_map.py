@@ -1,4 +1,4 @@
-"""Every file, name, test and setting that docs/paper-map.md names is there; likewise the files in the other pages."""
+"""Every file, name, test and setting that the paper map names exists, and every file that the other pages name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from tmc.kernel.config import SETTINGS
 
 ROOT = Path(__file__).parents[2]
-PAPER_MAP = (ROOT / "docs" / "paper-map.md").read_text("utf-8")
+PAPER_MAP = (ROOT / "docs" / "explanation" / "paper-map.md").read_text("utf-8")
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("docs/**/*.md"), *ROOT.glob("*.md")))
 LAWS = "Laws without a number (Sec. II-B to II-D)"
 PATH = re.compile(r"`((?:actors|deploy|docs|learner|tests|tmc)/[\w./-]*)(?:(::|:)([\w.]+))?`")

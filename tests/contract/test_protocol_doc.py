@@ -1,4 +1,4 @@
-"""docs/protocol.md says exactly what tmc/wire/messages.py says: each message, field, type, range, code and limit."""
+"""docs/reference/protocol.md agrees with tmc/wire/messages.py: each message, field, type, range, code and limit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tmc.kernel.world import World
 from tmc.wire import codec, fields, sockets
 from tmc.wire import messages as m
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text("utf-8")
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "reference" / "protocol.md").read_text("utf-8")
 NAMES = [cls.__name__ for cls in m.MESSAGES]
 POWERS = {2**62: "2^62", 2**63 - 1: "2^63 - 1", 2**31 - 1: "2^31 - 1"}
 UNITS = {"str": "characters", "bytes": "bytes", "array": "entries", "tensor": "entries"}
@@ -24,7 +24,7 @@ UNITS = {"str": "characters", "bytes": "bytes", "array": "entries", "tensor": "e
 def section(title: str, level: int = 2) -> str:
     """The text under a heading, up to the next heading of its level or above."""
     found = re.search(rf"^{'#' * level} {title}\n(.*?)(?=^#{{1,{level}}} |\Z)", DOCUMENT, re.MULTILINE | re.DOTALL)
-    assert found, f"docs/protocol.md has no section '{title}'"
+    assert found, f"docs/reference/protocol.md has no section '{title}'"
     return found[1]
 
 
@@ -72,13 +72,13 @@ def test_fields_types_and_ranges(cls: type[m.Message]) -> None:
 
 
 def test_every_message_has_a_sender_and_a_receiver() -> None:
-    table = rows(section("Who says what"))
+    table = rows(section("Messages by sender"))
     assert [named(row[0])[0] for row in table] == NAMES
     assert all(row[1] and row[2] for row in table)
 
 
 def test_every_answer_is_a_message() -> None:
-    assert {name for row in rows(section("Who says what")) for name in named(row[3])} <= {*NAMES, "ask"}
+    assert {name for row in rows(section("Messages by sender")) for name in named(row[3])} <= {*NAMES, "ask"}
 
 
 def sample(cls: type[m.Message]) -> m.Message:
@@ -95,7 +95,7 @@ def sample(cls: type[m.Message]) -> m.Message:
 
 @pytest.mark.parametrize("cls", m.MESSAGES, ids=NAMES)
 def test_the_tmc_takes_what_the_document_sends_to_it(cls: type[m.Message]) -> None:
-    receiver = {named(row[0])[0]: row[2] for row in rows(section("Who says what"))}
+    receiver = {named(row[0])[0]: row[2] for row in rows(section("Messages by sender"))}
     station = Station(World(build({"team.size": 1}), parse_raster("###\n#.#\n###")), "run", learning=True)
     station.handle("observer-test", sample(cls), 0.0)
     errors = [message for _, message in station.out.take().sends if isinstance(message, m.Error)]
@@ -112,7 +112,7 @@ def test_the_limits() -> None:
     assert limits == {
         "first frame": f"{codec.HEADER_LIMIT:,} bytes",
         "any frame": f"{sockets.PART_LIMIT:,} bytes",
-        "frames a message": f"{sockets.PARTS}",
+        "frames per message": f"{sockets.PARTS}",
     }
 
 

@@ -28,7 +28,7 @@ def test_text_summary_and_pictures(run, capsys):
 def test_json_is_all_of_stdout_and_the_file(run, capsys):
     assert main(["analyze", str(run), "--json", "--no-pictures"]) == 0
     out = capsys.readouterr().out
-    assert json.loads(out)["mission"]["who"] == "planner:greedy"
+    assert json.loads(out)["mission"]["controller"] == "planner:greedy"
     assert (run / "summary.json").read_text() == out
 
 
@@ -51,7 +51,7 @@ def test_without_matplotlib_it_says_how_to_install_it_and_goes_on(run, capsys, m
 
 
 class NoMatplotlib:
-    """An import hook that hides matplotlib."""
+    """Hide matplotlib by an import hook."""
 
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] == "matplotlib":
@@ -62,9 +62,9 @@ class NoMatplotlib:
     ("options", "sentence"),
     [
         (["--episode", "7"], "holds nothing of episode 7: ask for one of 1 to 2"),
-        (["--baseline", "greedy"], "is no NAME=VALUE"),
-        (["--baseline", "=0.3"], "is no NAME=VALUE"),
-        (["--baseline", "greedy=low"], "is no NAME=VALUE"),
+        (["--baseline", "greedy"], "is not NAME=VALUE"),
+        (["--baseline", "=0.3"], "is not NAME=VALUE"),
+        (["--baseline", "greedy=low"], "is not NAME=VALUE"),
     ],
 )
 def test_mistakes_are_one_sentence(run, capsys, options, sentence):

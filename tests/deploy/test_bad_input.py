@@ -1,4 +1,4 @@
-"""A user's mistake: one sentence with the mend, exit code 2, no traceback, and nothing left behind."""
+"""A user's mistake gives one sentence with the fix, exit code 2, no traceback, and leaves no files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`overfly doctor` does what missions do, and says what is wrong with the machine in a sentence."""
+"""`overfly doctor` tries what missions do, and names what is wrong with the machine in a sentence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.command import here
 
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing that takes long, or that this machine may lack, is looked at."""
+    """Skip checks that take long, or that this machine may fail."""
     for check in ("disk", "processes", "logs", "shared folder", "sockets", "limits", "map"):
         monkeypatch.delitem(doctor.CHECKS, check)
     monkeypatch.setattr(doctor.extras, "packages", tuple)

@@ -1,5 +1,7 @@
-"""Files and settings from elsewhere: whatever is wrong with them is one sentence, before anything starts where it can
-be, and a run folder is enough to go on with a run, wherever it lies."""
+"""Files and settings from elsewhere: what is wrong with them gives one sentence, before anything starts if possible.
+
+A run folder is enough to resume a run, at any place.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ from tests.command import LINE, here, overfly
 from tmc.kernel.config import Config, build
 from tmc.kernel.grid import Grid
 from tmc.kernel.policy import view_shape
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.wire.sockets import free_port
 
 EGO = {"observation.view": "ego", "observation.radius": 4, "network.channels": (4,), "network.dense": 8}
@@ -31,7 +33,7 @@ TOWN = "name: Old town\ncell_m: 20\n##########\n#...X....#\n#.......X#\n########
 
 
 def policy_of(config: Config, bad: float | None = None) -> bytes:
-    """A policy with the initial weights, one of its values made bad."""
+    """Return a policy with the initial weights, one of which is replaced by a bad value."""
     trainer = Trainer(config, view_shape(config, grid := Grid(30, 30)), grid)
     if bad is not None:
         with torch.no_grad():
@@ -56,7 +58,7 @@ def bad_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_values_that_are_not_finite_end_a_mission_of_processes(bad_policy: Path, tmp_path: Path) -> None:
-    """None is started again, and the sentence names the file, the UAV and the tick."""
+    """No process is restarted, and the sentence names the file, the UAV and the tick."""
     done = overfly("fly", bad_policy, "--actors", 2, "--ticks", 40, "--out", "R", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     told = [line for line in done.stderr.splitlines() if "not finite" in line]
@@ -105,7 +107,7 @@ def test_a_file_that_is_no_policy_is_named(tmp_path: Path, capsys, monkeypatch) 
 
 @pytest.fixture
 def anomalies(tmp_path: Path) -> Iterator[dict[str, Path]]:
-    """Paths that name no file; whoever opened some of them to read would wait for ever."""
+    """Return paths that do not name a file; a process that opened some of them to read would wait for ever."""
     os.mkfifo(tmp_path / "pipe")
     with socket.socket(socket.AF_UNIX) as bound, contextlib.chdir(tmp_path):  # its name may not be long
         bound.bind("socket")
@@ -196,7 +198,7 @@ def test_what_a_training_will_not_do_is_said_before_it_begins(tmp_path: Path) ->
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight over a map of the user's, whose file is gone: only read it, or a copy of it."""
+    """Return a flight over a user's map whose file is gone. Tests must not change it, only read or copy it."""
     folder = tmp_path_factory.mktemp("flown")
     (folder / "town.txt").write_text(TOWN)
     fly = ("fly", "planner:greedy", "--lockstep", "--actors", 2, "--ticks", 30, "--map", "town.txt", "--no-pictures")
@@ -207,7 +209,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def edited(run: Path, to: Path, **values: object) -> Path:
-    """A copy of a run folder with settings changed in its `config.json`."""
+    """Return a copy of a run folder with settings changed in its `config.json`."""
     shutil.copytree(run, to)
     config = json.loads((to / "config.json").read_text())
     (to / "config.json").write_text(json.dumps(config | {key.replace("__", "."): v for key, v in values.items()}))
@@ -215,7 +217,7 @@ def edited(run: Path, to: Path, **values: object) -> Path:
 
 
 def test_a_run_folder_brings_its_map_along(flown: Path, tmp_path: Path) -> None:
-    """Seen from another folder, under another name, without the file that the run was begun with."""
+    """From another folder, under another name, without the file that the run was started with."""
     shutil.copytree(flown, tmp_path / "moved run")
     both = here("evaluate", "moved run", "planner:random", "--seeds", 1, "--ticks", 20, "--jobs", 1, cwd=tmp_path)
     assert both.returncode == 0 and both.stderr == ""
@@ -232,7 +234,7 @@ def test_a_run_folder_brings_its_map_along(flown: Path, tmp_path: Path) -> None:
 
 
 def test_processes_fly_over_the_copy_in_the_run_folder(flown: Path, tmp_path: Path) -> None:
-    """A mission of processes that goes on after its map's file is gone."""
+    """A mission of processes is resumed after the file of its map is gone."""
     run = tmp_path / "R"
     shutil.copytree(flown, run)
     (run / "run.json").unlink()
@@ -264,7 +266,7 @@ def test_settings_edited_after_the_run_are_named_and_not_used(flown: Path, tmp_p
     told = here("analyze", "R", "--no-pictures", "--json", cwd=tmp_path)
     summary = json.loads(told.stdout)
     assert told.returncode == 0 and (summary["mission"]["seed"], summary["mission"]["episodes_planned"]) == (1, 1)
-    note = "config.json: training.episodes, training.seed changed since the run, the log's settings are used"
+    note = "config.json: training.episodes, training.seed changed since the run; the log's settings are used"
     assert summary["health"]["notes"] == [note]
     flies = here("evaluate", "R", "--seeds", 1, "--ticks", 5, "--jobs", 1, cwd=tmp_path)
     assert flies.returncode == 0 and flies.stderr == f"overfly: R: {note}\n"
@@ -295,7 +297,7 @@ def cannot_write(path: Path) -> bool:
 
 @pytest.mark.parametrize("command", READ_ONLY)
 def test_a_folder_that_cannot_be_written_is_read(flown: Path, tmp_path: Path, command: str) -> None:
-    """By its mode, or, since root may write all the same, mounted to be read only."""
+    """By its mode, or, since root may write nevertheless, by a read-only mount."""
     run = tmp_path / "R"
     shutil.copytree(flown, run)
     run.chmod(0o555)

@@ -1,4 +1,4 @@
-"""Packages that are missing, too old or broken: one sentence, before anything starts, with the line that mends it."""
+"""Missing, old or broken packages give one sentence, before anything starts, with the line that fixes it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fake:
 
 
 def hide(fake: Fake, *modules: str) -> None:
-    """Make processes find none of these modules, as where they are not installed."""
+    """Hide these modules from processes, as if they were not installed."""
     fake("sitecustomize.py", f"""
 import sys
 class Hidden:
@@ -51,14 +51,14 @@ sys.meta_path.insert(0, Hidden())
 
 
 def lacks(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """The same in this process."""
+    """Hide these modules in this process."""
     there = extras._is_there
     monkeypatch.setattr(extras, "_is_there", lambda module: module not in names and there(module))
 
 
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
-    """A folder to start commands in."""
+    """Return a folder to start commands in."""
     (tmp_path / "place").mkdir()
     return tmp_path / "place"
 
@@ -188,7 +188,7 @@ def test_versions_are_compared_by_their_numbers(older: str, newer: str) -> None:
 
 
 class Installed:
-    """A distribution with what pip noted of where it came from."""
+    """Return a distribution with pip's note of where it was installed from."""
 
     def __init__(self, told: Any) -> None:
         self.told = told

@@ -23,13 +23,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(flown: Path, tmp_path: Path) -> Path:
-    """A run folder of one's own."""
+    """Return a copy of a run folder."""
     shutil.copytree(flown, tmp_path / "R", ignore=shutil.ignore_patterns("report"))
     return tmp_path / "R"
 
 
 def damage(path: Path) -> None:
-    """One bit in the data of the first chunk."""
+    """Flip one bit in the data of the first chunk."""
     data = bytearray(path.read_bytes())
     data[data.index(b"\x04\x00\x00\x00zstd") + 30] ^= 1
     path.write_bytes(data)
@@ -59,7 +59,7 @@ def test_cat_of_damage_prints_what_is_sound_and_says_that_it_is_not_all(
     damage(run / "tmc.mcap")
     assert main(["log", "cat", str(run)]) == 1
     said = capsys.readouterr()
-    assert re.fullmatch(r"overfly: this is not all of it: tmc\.mcap: .*, at byte \d+\n", said.err)
+    assert re.fullmatch(r"overfly: the output is incomplete: tmc\.mcap: .*, at byte \d+\n", said.err)
 
 
 def test_recover_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""What is given as a log and is none: each command that reads logs says so in a sentence, at once, with exit code 2."""
+"""A file that is not a log: each command that reads logs refuses it in a sentence, at once, with exit code 2."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_recover_of_a_run_goes_on_behind_a_log_that_is_none(tmp_path: Path) -> N
     assert flown.returncode == 0
     (run / "learner.mcap.active").touch()
     done = here("log", "recover", run, cwd=tmp_path)
-    assert done.returncode == 1  # in part: it is no mistake in the command
+    assert done.returncode == 1  # in part, so it is not a mistake in the command
     assert "learner.mcap.active is empty" in done.stderr and "tmc.mcap: intact and finished" in done.stdout
 
 

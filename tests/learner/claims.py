@@ -1,4 +1,4 @@
-"""What is claimed of the learner's results, as one assertion: each gradient is the exact one, within rounding."""
+"""The claim on the learner's results, as one assertion: each gradient is the exact one, within rounding."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def assert_exact_within_rounding(config: Config, batches: Iterable[Batch]) -> No
 def batches_with_repeats(
     minibatch_of: Callable[..., Batch], config: Config, count: int, **fields: Any
 ) -> Iterator[Batch]:
-    """Minibatches in which most transitions come back, in other company, as those of a memory do."""
+    """Return minibatches in which most transitions recur, in other combinations, as from a replay memory."""
     pool, rng = minibatch_of(config, 77, b=24, **fields), np.random.Generator(np.random.Philox(5))
     names = [name for name, value in vars(pool).items() if isinstance(value, np.ndarray) and value.size]
     for number in range(count):

@@ -1,4 +1,4 @@
-"""What the learner's tests share: the presets, a small mission, and minibatches from addressed draws."""
+"""Fixtures of the learner's tests: the presets, a small mission, and minibatches from addressed draws."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ GRID = Grid(30, 30)
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """Sums in one order, and no fight for cores between test processes."""
+    """Set torch to one thread, so that sums have one order and test processes do not compete for cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -65,7 +65,7 @@ def preset(request: pytest.FixtureRequest) -> Config:
 
 @pytest.fixture
 def small() -> Callable[..., Config]:
-    """A config with a tiny network, with dotted keys replaced."""
+    """Return a config with a tiny network, with dotted keys replaced."""
     return lambda values=None: build({**SMALL, **(values or {})})
 
 
@@ -76,7 +76,7 @@ def trainer_of() -> Callable[[Config], Trainer]:
 
 @pytest.fixture
 def minibatch_of() -> Callable[..., Batch]:
-    """A minibatch that fits `config`; `number` names it, so that the same number gives the same one."""
+    """Return a minibatch that fits `config`; the same `number` gives the same minibatch."""
 
     def make(config: Config, number: int = 0, *, b: int = 6, episodes: int = 0, **fields: Any) -> Batch:
         rng = np.random.Generator(np.random.Philox(number))

@@ -1,4 +1,4 @@
-"""Adam is torch's, bit for bit, without what torch.optim.Adam imports."""
+"""Adam gives what torch.optim.Adam gives, bit for bit, without its imports."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ ROOT = Path(__file__).parents[2]
 
 
 def weights() -> list[nn.Parameter]:
-    """Weights as the Q-network has them: filters with the channels last, a matrix, and one that gets no gradient."""
+    """Return weights like the Q-network's: filters with the channels last, a matrix, and one without a gradient."""
     draw = torch.Generator().manual_seed(1)
     filters = torch.randn(4, 3, 3, 3, generator=draw).contiguous(memory_format=torch.channels_last)
     return [nn.Parameter(p) for p in (filters, torch.randn(9, 7, generator=draw), torch.randn(5, generator=draw))]
 
 
 def gradients(p: Tensor, seed: int) -> Tensor:
-    """Lying in memory as the weight does, which torch takes for granted."""
+    """Return a gradient with the memory layout of the weight, which torch assumes."""
     return torch.empty_like(p).copy_(torch.randn(p.shape, generator=torch.Generator().manual_seed(seed)))
 
 
 @pytest.mark.parametrize("layout", [torch.preserve_format, torch.contiguous_format])
 def test_every_step_is_that_of_torch(layout: torch.memory_format) -> None:
-    """However our gradients lie in memory."""
+    """For any memory layout of the gradients."""
     mine, theirs = weights(), weights()
     adam, reference = Adam(mine, 1e-3), torch.optim.Adam(theirs, lr=1e-3, fused=True)
     for n in range(20):

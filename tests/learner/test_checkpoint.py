@@ -1,4 +1,4 @@
-"""A checkpoint is there whole or not at all, and training goes on from it bit for bit."""
+"""A checkpoint is written whole or not at all, and training resumes from it bit for bit."""
 
 import json
 import logging
@@ -32,7 +32,7 @@ def go_on(path, trainer):
 
 @pytest.fixture
 def trained(small, trainer_of, minibatch_of):
-    """A trainer that has made some updates."""
+    """Return a trainer that has made some updates."""
 
     def make(updates=3, **values):
         trainer = trainer_of(small(values))
@@ -117,7 +117,7 @@ def test_a_writer_killed_in_between_leaves_the_older_checkpoint(tmp_path, traine
         patch.setattr(os, "fsync", kill) if step == "fsync" else patch.setattr(type(old), "replace", kill)
         with pytest.raises(Killed):
             checkpoint.save(tmp_path, trained(3))
-    assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-3.safetensors.part"]
+    assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-3.safetensors.new"]
     assert checkpoint.newest(tmp_path).name == old.name
     checkpoint.save(tmp_path, trained(4))
     assert names(tmp_path) == ["checkpoint-2.safetensors", "checkpoint-4.safetensors"]

@@ -97,7 +97,7 @@ def test_a_weight_multiplies_the_loss_of_its_transition(kind):
 
 @pytest.mark.parametrize(("kind", "b"), [("mse", 128), ("mse", 43), ("huber", 128), ("huber", 43)])
 def test_weights_of_one_change_nothing(kind, b):
-    """But for rounding: one division, and sums of b terms that torch may take in another order."""
+    """Equal except for rounding: one division, and sums of b terms that torch may add in another order."""
     td = torch.randn(b, generator=torch.Generator().manual_seed(b)) * 3
     results = []
     for weight in (None, torch.ones(b)):

@@ -1,4 +1,4 @@
-"""The policy file flies as the network that it was made from."""
+"""The policy file gives the values of the network that it was made from."""
 
 import numpy as np
 import onnx
@@ -35,7 +35,7 @@ def test_onnxruntime_gives_what_torch_gives(preset, batch):
 
 
 def assert_values_of(net, o, q):
-    """`q` is what the network gives, within what float32 can round."""
+    """Assert that `q` is the network's output, within float32 rounding."""
     exact = rounding.Net(net).forward(torch.tensor(o))
     assert ((torch.tensor(q).double() - exact.value).abs() <= exact.error).all()
 
@@ -74,7 +74,7 @@ def test_the_same_network_gives_the_same_bytes(preset):
 
 
 def test_export_copies_the_weights_and_runs_no_network(paper, monkeypatch):
-    """Which is why it takes milliseconds, where a trace takes seconds."""
+    """So it takes milliseconds, where a trace takes seconds."""
     net, card, model = make(paper)
     monkeypatch.setattr(qnet.QNet, "forward", lambda *_: pytest.fail("the network was run"))
     assert to_onnx(net, card) == model

@@ -1,4 +1,4 @@
-"""A learner that is forked from a process that has imported all it needs learns as one that was started."""
+"""A learner forked from a process with all imports done learns as one that was started directly."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ learn()
 
 
 def test_a_forked_learner_computes_the_same_bit_for_bit_on_its_threads() -> None:
-    """First in the fork, then in the process that was forked from."""
+    """Learn first in the fork, then in the process that it was forked from."""
     env = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-P", "-c", CODE], cwd=ROOT, env=env,

@@ -1,4 +1,4 @@
-"""How a minibatch is shared among threads; that the shares add up to its gradient, test_trainer.py shows."""
+"""How a minibatch is shared among threads. test_trainer.py tests that the shares add up to its gradient."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from learner import qnet
-from learner.gradient import PASSES, STEP, Gradient, shares
+from learner.gradient import GRADIENT_PASSES, SHARE_STEP_ROWS, Gradient, shares
 from tmc.kernel.config import build
 
 
@@ -26,13 +26,13 @@ def test_the_shares_are_all_rows_in_their_order(b: int, threads: int, passes: in
 @pytest.mark.parametrize("threads", [2, 3, 4])
 def test_who_computes_the_targets_has_less_to_do_besides(threads: int, passes: int) -> None:
     cuts = shares(128, threads, passes)
-    first, *others = (PASSES * (j - i) for i, j in pairwise(cuts))
-    assert max(others) - min(others) <= PASSES
+    first, *others = (GRADIENT_PASSES * (j - i) for i, j in pairwise(cuts))
+    assert max(others) - min(others) <= GRADIENT_PASSES
     if cuts[1]:
-        assert cuts[1] % STEP == 0
-        assert abs(first + passes - max(others)) <= PASSES * STEP
+        assert cuts[1] % SHARE_STEP_ROWS == 0
+        assert abs(first + passes - max(others)) <= GRADIENT_PASSES * SHARE_STEP_ROWS
     else:
-        assert passes >= max(others) - PASSES * STEP
+        assert passes >= max(others) - GRADIENT_PASSES * SHARE_STEP_ROWS
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -11,7 +11,7 @@ PAPER_SHAPE = (3, 30, 30)
 
 
 def plain_conv(x, weight, bias, stride):
-    """Convolution without padding, written as its definition. x (C, H, W), weight (F, C, k, k)."""
+    """Return the convolution without padding, written as its definition. x (C, H, W), weight (F, C, k, k)."""
     k = weight.shape[-1]
     rows, cols = ((n - k) // stride + 1 for n in x.shape[1:])
     y = np.empty((len(weight), rows, cols))
@@ -24,7 +24,7 @@ def plain_conv(x, weight, bias, stride):
 
 
 def plain_forward(net, o):
-    """Sec. IV-B in NumPy, one observation (C, H, W)."""
+    """Return the values of Sec. IV-B, computed in NumPy, for one observation (C, H, W)."""
     w = {name: p.detach().numpy().astype(float) for name, p in net.named_parameters()}
     bottom, right = net.pad
     x = np.pad(o.astype(float), ((0, 0), (0, bottom), (0, right)))
@@ -66,7 +66,7 @@ def test_forward_is_the_plain_loop(small, near):
 @pytest.mark.parametrize("height, width", [(17, 17), (30, 30), (31, 33), (12, 35), (10, 10), (21, 44)])
 @pytest.mark.parametrize("kernel, stride", [(4, 2), (3, 2), (4, 1)])
 def test_every_cell_of_the_view_counts(paper, height, width, kernel, stride):
-    """With strides, the convolutions leave out what is over at the end: a UAV there would not see its own mark."""
+    """With strides, convolutions leave out the last rows and columns: a UAV there would not observe itself."""
     config = build({"network.kernel": kernel, "network.stride": stride}, paper)
     net = qnet.build(config, (3, height, width))
     rng = torch.Generator().manual_seed(1)

@@ -1,4 +1,4 @@
-"""The gradient is the exact one within rounding: asked of the learner as it is, and of learners made wrong on purpose.
+"""The gradient is the exact one within rounding: tested on the learner, and on learners made wrong on purpose.
 
 The same assertion passes the first and must fail for each of the others, else it would claim nothing.
 """
@@ -46,7 +46,7 @@ def test_so_it_is_with_the_networks_of_the_presets(preset: Config, minibatch_of:
 
 
 def stale_values(patch: pytest.MonkeyPatch) -> None:
-    """What theta- said before it followed is taken for what it says now."""
+    """Target values of the old theta- are used after the copy."""
     patch.setattr(TargetValueCache, "forget", lambda self: None)
 
 
@@ -61,7 +61,7 @@ def mixed_up_values(patch: pytest.MonkeyPatch) -> None:
 
 
 def late_target(patch: pytest.MonkeyPatch) -> None:
-    """theta- never follows."""
+    """theta is never copied to theta-."""
     patch.setattr(Trainer, "_copy", lambda self: None)
 
 
@@ -77,7 +77,7 @@ def lost_share(patch: pytest.MonkeyPatch) -> None:
 
 
 def uneven_shares(patch: pytest.MonkeyPatch) -> None:
-    """Every share counts alike, however many rows it has."""
+    """Every share has the same weight, regardless of its number of rows."""
     share = Gradient._share
 
     def even(self: Gradient, o: Any, action: Any, targets: Any, rows: slice, weight: Any, b: int) -> Any:
@@ -119,7 +119,7 @@ def plain_double(patch: pytest.MonkeyPatch) -> None:
 
 
 def half_precision(patch: pytest.MonkeyPatch) -> None:
-    """Images are rounded to half precision: that is no float32."""
+    """Images are rounded to half precision instead of float32."""
     as_channels_last = trainer_module.as_channels_last
     patch.setattr(trainer_module, "as_channels_last", lambda image: as_channels_last(np.float16(image).astype("<f4")))
 
@@ -139,7 +139,7 @@ WRONG: dict[Callable[[pytest.MonkeyPatch], None], dict[str, Any]] = {
 
 
 @pytest.mark.parametrize(("wrong", "changes"), WRONG.items(), ids=[wrong.__name__ for wrong in WRONG])
-def test_a_wrong_learner_is_told_from_rounding(
+def test_a_wrong_learner_is_distinguished_from_rounding(
     small: Make, minibatch_of: Make, monkeypatch: pytest.MonkeyPatch, wrong: Any, changes: dict[str, Any]
 ) -> None:
     config = small({**FOLLOWS, **changes})
@@ -151,7 +151,7 @@ def test_a_wrong_learner_is_told_from_rounding(
 
 
 def of_float32(net: qnet.QNet, target: qnet.QNet, config: Config, batch: Batch) -> torch.Tensor:
-    """The gradient of eq. (9) as torch computes it, all weights in a row."""
+    """Return the gradient of eq. (9) as torch computes it, all weights in one row."""
     t = reference.Tensors(batch)
     with torch.no_grad():
         y = dqn.target(t.reward * config.dqn.reward_scale, t.discount, target(t.o_next), t.allowed)
@@ -192,7 +192,7 @@ def test_the_bound_holds_for_sums_in_any_order(small: Make, minibatch_of: Make) 
 
 
 def test_the_bound_holds_where_rounding_moves_a_unit_across_zero(small: Make, minibatch_of: Make) -> None:
-    """A hidden unit whose input is zero but for rounding: with it and without it, the gradient is within the bound."""
+    """A hidden unit's input is zero except for rounding: with and without it, the gradient is within the bound."""
     config, batch = small(), minibatch_of(small(), b=1)
     net, target = (qnet.build(small({"training.seed": seed}), batch.observation.shape[1:]) for seed in (1, 2))
     seen: list[torch.Tensor] = []

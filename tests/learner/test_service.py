@@ -1,4 +1,4 @@
-"""The learner's process: what it refuses before it touches its folder."""
+"""The learner's process: what it refuses before it writes to its folder, and how it greets a restarted TMC."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import zmq
 
 from learner.checkpoint import CheckpointError
-from learner.service import WINDOW, ReplacedError, Service
+from learner.service import MAX_REQUESTS, ReplacedError, Service
 from tests.command import PATIENCE_S
 from tmc.kernel.config import build, flat
 from tmc.kernel.world import World
@@ -24,7 +24,7 @@ NOWHERE = "tcp://127.0.0.1:1"
 
 
 def test_a_map_that_is_not_the_tmcs_is_refused(tmp_path: Path) -> None:
-    """Of the same name and size: it would draw its observations over another town."""
+    """A map of the same name and size: the learner would draw its observations over another town."""
     service = Service(NOWHERE, tmp_path / "R")
     welcome = m.Welcome(json.dumps(flat(build({}))), "another", "run", "", 0, 0)
     try:
@@ -36,7 +36,7 @@ def test_a_map_that_is_not_the_tmcs_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_welcome_to_another_mission_ends_the_learner(tmp_path: Path) -> None:
-    """A TMC that was started anew on the same port: what was learned here is not that mission's."""
+    """A new TMC on the same port: what was learned here does not belong to its mission."""
     service = Service(NOWHERE, tmp_path / "R")
     config = build({"network.channels": (2, 2), "network.dense": 2})
     world = World(config)
@@ -44,14 +44,14 @@ def test_a_welcome_to_another_mission_ends_the_learner(tmp_path: Path) -> None:
     try:
         service._prepare(first, None)
         with pytest.raises(EndpointError, match="another mission runs here now"):
-            service._obey(other)
-        assert not service._obey(first)
+            service._handle(other)
+        assert not service._handle(first)
     finally:
         service.close()
 
 
 def test_damaged_checkpoints_are_not_passed_over_for_new_weights(tmp_path: Path) -> None:
-    """What was learned would be gone without a word, and the team flies on by what is not trained."""
+    """Otherwise what was learned would be lost silently, and the team would fly an untrained policy."""
     folder = tmp_path / "R" / "checkpoints"
     folder.mkdir(parents=True)
     (folder / "checkpoint-7.safetensors").write_bytes(b"not a checkpoint")
@@ -64,7 +64,7 @@ def test_damaged_checkpoints_are_not_passed_over_for_new_weights(tmp_path: Path)
 
 
 def heard(tmc: zmq.Socket[Any], count: int) -> list[str]:
-    """The kinds of the next `count` messages, after which nothing more comes."""
+    """Return the kinds of the next `count` messages; assert that no more follow."""
     said = []
     while tmc.poll(200 if len(said) >= count else 1000 * PATIENCE_S):
         frames = sockets.receive(tmc)
@@ -74,7 +74,7 @@ def heard(tmc: zmq.Socket[Any], count: int) -> list[str]:
 
 
 def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tmp_path: Path, short: Path) -> None:
-    """It finds several hellos when it is back, and welcomes each."""
+    """A restarted TMC receives several Hellos and answers each with Welcome."""
     tmc = sockets.router(context := zmq.Context(), f"ipc://{short}/sync.feed")
     service = Service(f"ipc://{short}/sync", tmp_path / "R")
     config = build({"network.channels": (2, 2), "network.dense": 2})
@@ -82,14 +82,14 @@ def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tm
 
     try:
         service._prepare(welcome, None)
-        service._push()
-        service._ask()
-        assert heard(tmc, 1 + WINDOW) == ["PolicyPush", *["SampleRequest"] * WINDOW]
-        service._hailed = True  # after a second of silence, and another one
+        service._publish()
+        service._request_minibatches()
+        assert heard(tmc, 1 + MAX_REQUESTS) == ["PolicyPush", *["SampleRequest"] * MAX_REQUESTS]
+        service._hello_sent = True  # after a second of silence, and another one
         for _ in range(3):
-            service._obey(welcome)
-        assert heard(tmc, 1 + WINDOW) == ["PolicyPush", *["SampleRequest"] * WINDOW]
-        assert len(service._flying) == WINDOW
+            service._handle(welcome)
+        assert heard(tmc, 1 + MAX_REQUESTS) == ["PolicyPush", *["SampleRequest"] * MAX_REQUESTS]
+        assert len(service._in_flight) == MAX_REQUESTS
     finally:
         service.close()
         tmc.close()
@@ -99,8 +99,8 @@ def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tm
 def test_a_learner_leaves_when_a_newer_one_has_its_place(tmp_path: Path) -> None:
     service = Service(NOWHERE, tmp_path / "R")
     try:
-        assert not service._obey(m.Error("fenced", "a newer process is the learner: leave", service.incarnation + 1))
+        assert not service._handle(m.Error("fenced", "a newer process is the learner: leave", service.incarnation + 1))
         with pytest.raises(ReplacedError, match="a newer process is the learner"):
-            service._obey(m.Error("fenced", "a newer process is the learner: leave", service.incarnation))
+            service._handle(m.Error("fenced", "a newer process is the learner: leave", service.incarnation))
     finally:
         service.close()

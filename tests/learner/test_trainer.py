@@ -22,19 +22,19 @@ def weights(net):
 
 
 def same(a, b):
-    """True when the two trainers have the same state, bit for bit."""
+    """Return whether the two trainers have the same state, bit for bit."""
     a, b = a.state(), b.state()
     counters = (a.updates, a.version, a.copied) == (b.updates, b.version, b.copied)
     return counters and all(torch.equal(a.tensors[k], b.tensors[k]) for k in a.tensors | b.tensors)
 
 
 def following(batch):
-    """All images of o'."""
+    """Return all images of o'."""
     return batch.next_observation(np.arange(len(batch.action)))
 
 
 class PlainAdam:
-    """Adam as Kingma and Ba give it (Algorithm 1), in float64, from the weights of `net`."""
+    """Adam as published by Kingma and Ba (Algorithm 1), in float64, from the weights of `net`."""
 
     def __init__(self, net, lr):
         self.theta, self.lr, self.t = weights(net).double(), lr, 0
@@ -86,7 +86,7 @@ def test_metrics_are_those_of_the_minibatch_before_the_step(small, trainer_of, m
 
 
 def copies(trainer, minibatch_of, episodes):
-    """The indices of the minibatches, stamped with these counts of episodes, before which theta- was set to theta."""
+    """Return the indices of the minibatches, with these episode counts, before which theta was copied to theta-."""
     found = []
     for i, n in enumerate(episodes):
         theta, before = weights(trainer.online), weights(trainer.target)
@@ -99,7 +99,7 @@ def copies(trainer, minibatch_of, episodes):
 
 
 def test_target_follows_exactly_every_five_episodes(small, trainer_of, minibatch_of):
-    episodes = [n // 3 for n in range(51)]  # three updates an episode
+    episodes = [n // 3 for n in range(51)]  # three updates per episode
     assert copies(trainer_of(small()), minibatch_of, episodes) == [15, 30, 45]
 
 
@@ -151,7 +151,7 @@ def test_the_loss_falls_on_a_fixed_problem(small, trainer_of, minibatch_of):
 
 
 def test_a_constant_reward_is_worth_its_geometric_sum(small, trainer_of, minibatch_of):
-    """The time limit is no terminal state: with r = 1 and gamma = 0.5 for ever, Q is 1 / (1 - gamma) = 2."""
+    """The time limit is not a terminal state: with r = 1 and gamma = 0.5 for ever, Q is 1 / (1 - gamma) = 2."""
     config = small({"dqn.gamma": 0.5, "dqn.learning_rate": 0.003, "dqn.target_episodes": 0, "dqn.target_updates": 20})
     trainer = trainer_of(config)
     for n in range(600):
@@ -253,13 +253,13 @@ def test_metrics_are_plain_floats(small, trainer_of, minibatch_of):
 
 @pytest.mark.parametrize("double", [False, True])
 def test_values_that_are_kept_change_nothing(small, trainer_of, minibatch_of, double):
-    """The gradients are those that have every value computed every time; theta- follows in between."""
+    """The gradients equal those with every value computed every time; theta- changes in between."""
     config = small({"dqn.target_episodes": 0, "dqn.target_updates": 10, "dqn.double": double})
     assert_exact_within_rounding(config, batches_with_repeats(minibatch_of, config, 60))
 
 
 def passes(trainer, batches):
-    """How many rows the target network computes in each update."""
+    """Count the rows that the target network computes in each update."""
     rows = []
     hook = trainer.target.register_forward_pre_hook(lambda _, inputs: rows.append(len(inputs[0])))
     counts = []
@@ -278,8 +278,8 @@ def test_a_value_is_computed_once_until_the_target_follows(small, trainer_of, mi
 
 
 @pytest.mark.parametrize("lose", ["forget", "load"])
-def test_nothing_is_known_of_transitions_that_are_numbered_anew(small, trainer_of, minibatch_of, lose):
-    """The same numbers stand for other transitions after that: the update must be that of a trainer who knows none."""
+def test_nothing_is_known_of_transitions_that_are_numbered_again(small, trainer_of, minibatch_of, lose):
+    """Afterwards the same numbers are other transitions: the update must be that of a trainer with an empty cache."""
     trainer, fresh = trainer_of(small()), trainer_of(small())
     old, new = minibatch_of(trainer.config, 1), minibatch_of(trainer.config, 2, index=minibatch_of(small(), 1).index)
     trainer.update(old)
@@ -289,7 +289,7 @@ def test_nothing_is_known_of_transitions_that_are_numbered_anew(small, trainer_o
     assert same(trainer, fresh)
 
 
-def test_two_transitions_with_one_place_are_told_apart(small, trainer_of, minibatch_of):
+def test_two_transitions_with_one_place_are_distinguished(small, trainer_of, minibatch_of):
     config = small({"replay.capacity": 4, "replay.learn_start": 1, "dqn.target_episodes": 1000})
     assert_exact_within_rounding(config, batches_with_repeats(minibatch_of, config, 20))
 
@@ -307,7 +307,7 @@ def test_transitions_without_numbers_are_refused(small, trainer_of, minibatch_of
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_weights_count_as_in_the_plain_equations(preset, trainer_of, minibatch_of, threads):
-    """The gradient is that of the mean of weight times loss, whatever the threads that share it."""
+    """The gradient is that of the mean of weight times loss, for any number of threads."""
     config = build({**flat(preset), "replay.priority_exponent": 0.6, "training.threads": threads})
     trainer = trainer_of(config)
     weight = np.array([1.0, 0.5, 0.1, 0.9, 0.3, 0.7], "<f4")
@@ -337,7 +337,7 @@ def test_weights_of_one_count_as_none(paper, trainer_of, minibatch_of):
             assert ((reference.gradient(trainer.online).double() - exact).abs() <= bound).all()
 
 
-def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatch_of):
+def test_the_errors_of_the_last_update_are_given_once(small, trainer_of, minibatch_of):
     trainer = trainer_of(small({"replay.priority_exponent": 0.6}))
     assert [x.size for x in trainer.take_td_errors()] == [0, 0]
     batch = minibatch_of(trainer.config)
@@ -347,11 +347,11 @@ def test_the_errors_of_the_last_update_are_told_once(small, trainer_of, minibatc
     assert errors.shape == (6,) and errors.mean() == pytest.approx(metrics.td_abs) and (errors >= 0).all()
     assert [x.size for x in trainer.take_td_errors()] == [0, 0]
     trainer.update(batch)
-    trainer.forget()  # the numbers begin anew
+    trainer.forget()  # the numbers start again
     assert [x.size for x in trainer.take_td_errors()] == [0, 0]
 
 
-def test_without_priorities_no_errors_are_told(small, trainer_of, minibatch_of):
+def test_without_priorities_no_errors_are_given(small, trainer_of, minibatch_of):
     trainer = trainer_of(small())
     trainer.update(minibatch_of(trainer.config))
     assert [x.size for x in trainer.take_td_errors()] == [0, 0]

@@ -1,4 +1,4 @@
-"""Fixtures: the logs that every reader gets, and what our own reader says that they hold."""
+"""Fixtures: the logs that every reader gets, and their contents by Overfly's own reader."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tmc.record.reader import Log, LogMessage
 
 @dataclass
 class Topic:
-    """A topic of one log by our own reader: its schema, and its messages in file order."""
+    """A topic of one log by Overfly's own reader: its schema, and its messages in file order."""
 
     schema: str
     entries: list[LogMessage] = field(default_factory=list)
@@ -48,7 +48,7 @@ KINDS = {
     "resumed": ["resumed-*/*.mcap"],
     "recovered": ["recovered-*/*.mcap"],
 }
-"""Each kind of file that we write, and where the missions have left it."""
+"""Each kind of file that Overfly writes, and where the missions have left it."""
 
 
 @pytest.fixture(params=KINDS)
@@ -69,7 +69,7 @@ def killed(missions: Path, tmp_path: Path) -> list[Path]:
 
 @pytest.fixture
 def ours() -> Callable[[Path], dict[str, Topic]]:
-    """{topic: what our own reader finds of it}."""
+    """Return {topic: what Overfly's own reader finds of it}."""
 
     def read(path: Path) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}

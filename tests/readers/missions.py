@@ -83,14 +83,14 @@ def _records(log: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def resume(left: Path, folder: Path) -> None:
-    """Recover logs as processes do that are started again and have nothing more to say."""
+    """Recover logs as restarted processes do that write no more messages."""
     for active in _copies(left, folder):
         path = active.with_name(active.name.removesuffix(ACTIVE))
         LogWriter(path, path.stem, JournalConfig(), {}, resume=True).close()
 
 
 def recover(left: Path, folder: Path) -> None:
-    """Recover logs as a user does; exit code 3 says that something is lost."""
+    """Recover logs as a user does; exit code 3 means that data are lost."""
     _copies(left, folder)
     done = here("log", "recover", folder, "--in-place", cwd=folder)
     assert done.returncode in (0, 3), done.stderr
@@ -102,7 +102,7 @@ def _copies(left: Path, folder: Path) -> list[Path]:
 
 
 def lose_one(out: Path) -> None:
-    """A flight in which one of two UAVs falls silent for so long that the other goes on without it."""
+    """Fly a mission in which one of two UAVs is silent for so long that the other flies on without it."""
     with subprocess.Popen([*line_of_trial(stall=0.06), *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
         _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
         (silent,) = (
@@ -115,13 +115,13 @@ def lose_one(out: Path) -> None:
 
 
 def kill_in_flight(out: Path) -> None:
-    """SIGKILL supervisor, TMC, learner and UAVs once each of them has a message in its log."""
+    """Kill supervisor, TMC, learner and UAVs once each of them has a message in its log."""
     with subprocess.Popen([*line_of_trial(stall=0.01), *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
         try:
             _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in WRITERS])
             time.sleep(0.5)
         finally:
-            family = [run.pid, *descendants(run.pid)]  # the supervisor first: it would start the others again
+            family = [run.pid, *descendants(run.pid)]  # the supervisor first, since it would restart the others
             for process in family:
                 with suppress(ProcessLookupError):
                     os.kill(process, signal.SIGKILL)

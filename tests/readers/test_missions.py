@@ -1,4 +1,4 @@
-"""What the readers are given is worth reading: every topic is there, and the killed mission was in flight."""
+"""The readers' logs are complete: every topic is there, and the killed mission was in flight."""
 
 from __future__ import annotations
 

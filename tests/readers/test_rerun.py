@@ -1,4 +1,4 @@
-"""Rust: rerun-sdk finds nothing to complain of, and decodes every message of every log to what we read."""
+"""Rust: rerun-sdk reports no issue, and decodes every message of every log as Overfly's reader does."""
 
 from __future__ import annotations
 

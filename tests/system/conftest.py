@@ -24,12 +24,12 @@ def overfly(tmp_path: Path) -> Overfly:
 
 @pytest.fixture
 def here(tmp_path: Path) -> Overfly:
-    """The same in this process, for what starts no process."""
+    """Run `overfly ARGS` in this process, for commands that start no process."""
     return lambda *args: command.here(*args, cwd=tmp_path)
 
 
 def processes_of(marker: str) -> list[int]:
-    """Processes whose command line names `marker`."""
+    """Return the processes whose command line names `marker`."""
     found = []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit() and int(folder.name) != os.getpid():
@@ -44,13 +44,13 @@ def processes_of(marker: str) -> list[int]:
 
 @pytest.fixture
 def running() -> Callable[[str], list[int]]:
-    """The ids of the processes whose command line names a text."""
+    """Return a function that returns the ids of the processes whose command line names a text."""
     return processes_of
 
 
 @pytest.fixture(autouse=True)
 def no_process_left(tmp_path: Path) -> Iterator[None]:
-    """Whatever a test started with its folder in the command line is gone when it ends."""
+    """Assert that every process with the test's folder in its command line has ended with the test."""
     yield
     until = time.monotonic() + PATIENCE_S
     while (left := processes_of(str(tmp_path))) and time.monotonic() < until:

@@ -1,4 +1,4 @@
-"""Hosts on one machine: a network namespace each, and a switch in user space that delays, loses and cuts.
+"""Hosts on one machine: one network namespace per host, and a switch in user space that delays, loses and cuts.
 
 Each host has one TAP device, which the kernel takes for an Ethernet card; what it sends comes out of a file here, and
 what is written to that file arrives there. So no queueing discipline of the kernel is needed (netem is often missing),
@@ -46,7 +46,7 @@ class Switch(threading.Thread):
         self._ear, self._mouth = os.pipe()
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Carry frames until `stop`."""
         poller = select.poll()
         by_file = {file: port for port, file in enumerate(self.ports)}
         for file in (*self.ports, self._ear):
@@ -68,7 +68,7 @@ class Switch(threading.Thread):
         os.close(self._mouth)
 
     def _take(self, port: int) -> None:
-        """One frame from a host."""
+        """Take one frame from a host."""
         try:
             frame = os.read(self.ports[port], _FRAME)
         except BlockingIOError:
@@ -87,29 +87,29 @@ class Switch(threading.Thread):
                 heapq.heappush(self._late, (time.monotonic() + self.delay, next(self._order), to, frame))
 
     def _give(self, port: int, frame: bytes) -> None:
-        """One frame to a host; a full queue loses it, as a switch does."""
+        """Deliver one frame to a host; a full queue loses it, as in a switch."""
         with contextlib.suppress(BlockingIOError):
             os.write(self.ports[port], frame)
             self.passed += 1
 
 
 class Hosts:
-    """What a test sees: an address and a way to start commands for each host, numbered from 0."""
+    """The hosts of a test, numbered from 0: each has an address and a way to start commands."""
 
     def __init__(self, names: list[str], switch: Switch) -> None:
         self.names, self.switch = names, switch
 
     def address(self, host: int) -> str:
-        """The host's IPv4 address."""
+        """Return the host's IPv4 address."""
         return _address(host)
 
     def on(self, host: int, *command: object) -> list[str]:
-        """The command line that runs `command` on a host."""
+        """Return the command line that runs `command` on a host."""
         return ["ip", "netns", "exec", self.names[host], *map(str, command)]
 
     @contextlib.contextmanager
     def cut(self, host: int) -> Iterator[None]:
-        """Pull a host's cable for the length of the block."""
+        """Disconnect a host for the length of the block."""
         self.switch.away.add(host)
         try:
             yield
@@ -119,8 +119,8 @@ class Hosts:
 
 @contextlib.contextmanager
 def hosts(count: int, *, delay: float = 0.02, loss: float = 0.02, seed: int = 0) -> Iterator[Hosts]:
-    """`count` hosts behind one switch, `delay` seconds and `loss` each way; all is removed at the end."""
-    run = f"{os.getpid():x}-{next(_ROUNDS)}"  # so that test runs side by side do not meet
+    """Yield `count` hosts behind one switch, with `delay` seconds and `loss` each way; remove them at the end."""
+    run = f"{os.getpid():x}-{next(_ROUNDS)}"  # so that parallel test runs use different names
     with contextlib.ExitStack() as undo:
         names, ports = [], []
         for host in range(count):
@@ -141,7 +141,7 @@ def hosts(count: int, *, delay: float = 0.02, loss: float = 0.02, seed: int = 0)
 
 
 def why_not() -> str:
-    """Why this machine cannot have such hosts; empty when it can."""
+    """Return why this machine cannot have such hosts; "" if it can."""
     if os.geteuid():
         return "network namespaces need root"
     if shutil.which("ip") is None:
@@ -165,7 +165,7 @@ def _ip(*words: str) -> None:
 
 
 def _tap(device: str) -> int:
-    """The file of a new TAP device, which incarnations as long as the file is open."""
+    """Return the file of a new TAP device, which exists as long as the file is open."""
     file = os.open(_TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         fcntl.ioctl(file, _TUNSETIFF, struct.pack("16sH22x", device.encode(), _IFF_TAP | _IFF_NO_PI))

@@ -1,4 +1,4 @@
-"""A whole mission killed with SIGKILL: its logs are checked, recovered and compacted; what was flushed is all there."""
+"""A mission killed as a whole: its logs are checked, recovered and compacted, and nothing that was flushed is lost."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def test_a_mission_that_was_killed_is_checked_recovered_and_sealed(here, running
 
 
 def held(path: Path) -> int:
-    """Messages in a log."""
+    """Return the number of messages in a log."""
     return sum(1 for _ in Log(path).raw())
 
 
 def flying(path: Path) -> bool:
-    """The TMC has logged flight records."""
+    """Return whether the TMC has logged flight records."""
     return path.is_file() and path.stat().st_size > 30_000
 
 

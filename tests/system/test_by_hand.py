@@ -8,7 +8,7 @@ from pathlib import Path
 import zmq
 
 from tests.command import LINE, PATIENCE_S
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.wire import messages as m
 from tmc.wire import sockets
 from tmc.wire.codec import encode

@@ -1,4 +1,4 @@
-"""`overfly verify chaos` itself, small: nothing is lost, whatever is killed, unless the TMC acknowledges too early."""
+"""Small runs of `overfly verify chaos`: no kill loses a record, unless the TMC acknowledges too early."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIGHT = ("--actors", "2", "--ticks", "200", "--set", "dqn.batch_size=8", "--set"
 
 
 def schedule(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
-    """The trial's row; nothing but progress may have gone to stderr."""
+    """Run a trial; return its row. Its stderr must hold progress only."""
     done = overfly("verify", "chaos", *options)
     assert done.returncode == code, done.stdout + done.stderr
     assert done.stderr and all(line.startswith(("kill ", "mission-")) for line in done.stderr.splitlines())
@@ -30,28 +30,30 @@ def schedule(overfly: Overfly, *options: str, code: int = 0) -> dict[str, Any]:
     [(8, 4, ()), (3, 2, ("--scenario", "1")), (3, 2, ("--set", "comms.phase=staggered"))],
     ids=str,
 )
-def test_missions_that_are_disturbed_fly_what_lock_step_flies(
+def test_missions_under_faults_fly_what_lock_step_flies(
     overfly: Overfly, tmp_path: Path, kills: int, episodes: int, options: tuple[str, ...]
 ) -> None:
     row = schedule(overfly, "--mode", "fly", "--kills", str(kills), "--episodes", str(episodes), *SHORT, *options)
-    assert row["faults"] == [] and row["folder"] == ""
-    assert sum(row["kills"].values()) == kills and row["back"] == row["kills"]
+    assert row["violations"] == [] and row["folder"] == ""
+    assert sum(row["kills"].values()) == kills and row["recovered"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
     assert row["episodes"] == episodes * row["missions"] and row["ticks"] == 400 * row["episodes"]
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.slow
-def test_a_training_that_is_disturbed_goes_on(overfly: Overfly) -> None:
+def test_a_training_under_faults_resumes(overfly: Overfly) -> None:
     row = schedule(overfly, "--kills", "5", "--fault-seed", "20", *LIGHT)
-    assert row["faults"] == [] and set(row["kills"]) == {"tmc", "learner", "uav"} and row["back"] == row["kills"]
+    assert (
+        row["violations"] == [] and set(row["kills"]) == {"tmc", "learner", "uav"} and row["recovered"] == row["kills"]
+    )
     assert row["lost"] == row["doubled"] == 0 and row["updates"] > 0 and row["acknowledged"] > 0
 
 
 @pytest.mark.slow
 def test_power_cuts_take_nothing_that_was_acknowledged(overfly: Overfly) -> None:
     row = schedule(overfly, "--mode", "fly", "--power", "--kills", "5", "--fault-seed", "2", "--episodes", "4", *SHORT)
-    assert row["faults"] == [] and row["kills"]["power"] >= 1 and row["back"] == row["kills"]
+    assert row["violations"] == [] and row["kills"]["power"] >= 1 and row["recovered"] == row["kills"]
     assert row["lost"] == row["doubled"] == 0 and row["acknowledged"] > 100
 
 
@@ -77,7 +79,7 @@ def test_power_cuts_take_what_was_acknowledged_without_the_disk(overfly: Overfly
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [("--mode", "fly", "--episodes", "2", *SHORT), LIGHT], ids=["fly", "train"])
 def test_losses_are_seen_when_there_are_some(overfly: Overfly, tmp_path: Path, options: tuple[str, ...]) -> None:
-    """The counter-check. What was kept shows it too: the last commit is older than what was acknowledged."""
+    """The counter-check. The kept files show it too: the last commit is older than the last acknowledgement."""
     row = schedule(overfly, "--ack-early", "--kills", "12", *options, "--keep", str(tmp_path / "kept"), code=1)
-    assert row["lost"] > 0 and any("were acknowledged and are lost" in fault for fault in row["faults"])
-    assert row["folder"] == str(tmp_path / "kept") and "did not survive" in (tmp_path / "kept/diary.txt").read_text()
+    assert row["lost"] > 0 and any("were acknowledged and are lost" in violation for violation in row["violations"])
+    assert row["folder"] == str(tmp_path / "kept") and "did not survive" in (tmp_path / "kept/history.txt").read_text()

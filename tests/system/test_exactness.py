@@ -18,7 +18,7 @@ COUNTER = count()
 
 @st.composite
 def rasters(draw: st.DrawFn) -> list[str]:
-    """Small maps with a street along the top, so that UAVs are often next to each other."""
+    """Draw small maps with a street along the top, so that UAVs are often next to each other."""
     cols, rows = draw(st.integers(3, 8)), draw(st.integers(2, 7))
     cells = st.sampled_from(ROAD * 5 + FREE * 3 + BLOCKED)
     return [ROAD * cols] + ["".join(draw(st.lists(cells, min_size=cols, max_size=cols))) for _ in range(rows - 1)]
@@ -26,7 +26,7 @@ def rasters(draw: st.DrawFn) -> list[str]:
 
 @st.composite
 def missions(draw: st.DrawFn) -> tuple[list[str], dict[str, Any]]:
-    """A map, and settings of a mission on it."""
+    """Draw a map, and settings of a mission on it."""
     raster = draw(rasters())
     roads = sum(row.count(ROAD) for row in raster)
     return raster, {

@@ -12,7 +12,7 @@ import pytest
 
 from tests.command import LINE, PATIENCE_S
 from tests.system.hosts import Hosts, hosts, why_not
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.record.reader import read
 
 TEAM = ("--actors", 4, "--seed", 7)
@@ -35,7 +35,7 @@ def three() -> Iterator[Hosts]:
 
 @contextlib.contextmanager
 def mission(net: Hosts, folder: Path, ticks: int) -> Iterator[list[subprocess.Popen[str]]]:
-    """The TMC and the UAVs by hand, each on its host; none outlives the block."""
+    """Start the TMC and the UAVs by hand, each on its host; end them with the block."""
     here = ("tmc", "--fly", "planner:greedy", *TEAM, "--ticks", ticks, "--bind", "tcp://0.0.0.0:5555")
     there = f"tcp://{net.address(0)}:5555"
     with contextlib.ExitStack() as undo:
@@ -70,7 +70,7 @@ def test_three_hosts_fly_what_one_process_flies(here, three: Hosts, tmp_path: Pa
 
 
 def test_a_host_that_is_cut_off_in_flight_and_comes_back_changes_nothing(here, three: Hosts, tmp_path: Path) -> None:
-    """5 s is longer than the sockets' heartbeats allow: connections drop, and what was under way is lost."""
+    """5 s is longer than the sockets' heartbeats allow: connections drop, and messages in transit are lost."""
     with mission(three, tmp_path, 150) as processes:
         until_flown(tmp_path / "U" / "uav-003.mcap.active", uav=3, tick=50)
         with three.cut(2):
@@ -81,7 +81,7 @@ def test_a_host_that_is_cut_off_in_flight_and_comes_back_changes_nothing(here, t
 
 
 def until_flown(log: Path, uav: int, tick: int) -> None:
-    """Wait until a UAV's log says that it has reached a tick."""
+    """Wait until a UAV has reached a tick, by its log."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         if log.exists() and any(status.message.tick >= tick for status in read(log, [f"/uav/{uav}/status"])):

@@ -1,4 +1,4 @@
-"""Names that are no plain words, folders that go away, and clocks that jump: with real processes."""
+"""Unusual names, folders that are removed, and clocks that jump, with real processes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def overfly(cwd: Path, *args: object, timeout: float = PATIENCE_S) -> subprocess
 
 @pytest.mark.parametrize("name", NAMES.values(), ids=NAMES)
 def test_a_run_folder_may_be_called_anything(name: bytes, tmp_path: Path) -> None:
-    """It is flown in, resumed, summed up and checked; what is said of it cannot move the cursor."""
+    """A mission is flown in it, resumed, analyzed and checked; its name in messages cannot move the cursor."""
     out = os.fsdecode(name)
     try:
         (tmp_path / out).mkdir()
@@ -95,7 +95,7 @@ def until(what: Callable[[], object], run: subprocess.Popen[str]) -> None:
 
 @pytest.mark.parametrize(("moved", "lockstep"), [(False, False), (True, False), (False, True)])
 def test_a_run_folder_that_goes_away_ends_the_mission(moved: bool, lockstep: bool, tmp_path: Path) -> None:
-    """In one process a folder that was moved is noticed at the end only: until then nothing is lost."""
+    """In one process a moved folder is noticed only at the end; until then nothing is lost."""
     line = [*LINE, "fly", "planner:greedy", "--actors", "2", "--ticks", "60000", "--out", "R"]
     line += ["--lockstep"] if lockstep else []
     with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
@@ -130,7 +130,7 @@ def test_a_tmc_by_hand_leaves_no_socket_and_notices_that_its_folder_is_gone(tmp_
 
 
 def test_a_wall_clock_that_jumps_does_not_lengthen_a_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a day forward, and back, at every message."""
+    """The clock jumps by a day, forward and back, at every message."""
     day, now = 86_400 * 10**9, LogWriter.now
     jumps = iter(range(1, 10**9))
     monkeypatch.setattr(LogWriter, "now", lambda self: now(self) + next(jumps) % 2 * day)

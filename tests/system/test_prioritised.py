@@ -1,6 +1,4 @@
-"""A training with `replay.priority_exponent`, as processes and in lock step: its log tells all but what the learner
-found.
-"""
+"""A training with `replay.priority_exponent`, as processes and in lock step: its log holds all but the TD errors."""
 
 from __future__ import annotations
 
@@ -40,9 +38,9 @@ def test_it_trains_as_processes_and_its_log_is_sound(
     records = [e.message for e in Log(out / "tmc.mcap").entries() if e.topic.endswith("/record")]
     assert len(records) == 3 * 3 * 7 and all(len(r.values) == 2 * len(r.actions) for r in records)
     assert any(r.values for r in records)
-    for name in ("tmc", "learner"):  # neither refused what the other said
+    for name in ("tmc", "learner"):  # neither refused a message of the other
         said = [e.message.message for e in Log(out / f"{name}.mcap").entries(["/log"])]
-        assert not [text for text in said if "rejected" in text or "the TMC says" in text]
+        assert not [text for text in said if "rejected" in text or "error from the TMC" in text]
 
 
 def test_the_learner_changes_priorities_and_the_journal_has_the_first_ones(tmp_path: Path) -> None:

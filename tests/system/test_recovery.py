@@ -1,4 +1,4 @@
-"""Real processes killed with SIGKILL, and the run that goes on as if nothing had happened; and what cannot go on."""
+"""Real processes killed with SIGKILL: the run resumes with the same result. And runs that cannot be resumed."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from tests.command import LINE, PATIENCE_S, line_of_trial
 from tmc.analysis.invariants.check import check
 from tmc.center.journal import journal_in
 from tmc.kernel.config import JournalConfig
-from tmc.record.facts import digest
-from tmc.record.mcap.parser import frames
+from tmc.record.mcap import strict
+from tmc.record.queries import digest
 from tmc.record.reader import Log
+from tmc.record.run_folder import RunFolder
 from tmc.record.writer import LogWriter
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
@@ -34,7 +35,7 @@ SLOW = line_of_trial(stall=0.01)
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The digest of the flight when nobody disturbs it."""
+    """Return the digest of the flight without kills."""
     out = tmp_path_factory.mktemp("undisturbed") / "R"
     assert main([*FLIGHT, "--lockstep", "--out", str(out)]) == 0
     return digest(out)
@@ -54,8 +55,8 @@ def wait_for(what: Callable[[], object], run: subprocess.Popen[str]) -> None:
 
 
 def ended(out: Path) -> int:
-    """Episodes that have ended, as the journal has it by now."""
-    journal = journal_in(out)
+    """Return the number of episodes that have ended, by the journal so far."""
+    journal = RunFolder(out).existing_journal()
     if journal is None:
         return 0
     ends = [e.message.episode for e in Log(journal).entries(["/tmc/episode"]) if e.message.phase == "end"]
@@ -68,7 +69,7 @@ def records(out: Path) -> int:
 
 
 def kill_all(run: subprocess.Popen[str], running: Running, out: Path) -> None:
-    """The supervisor first, so that it starts nobody again; then all that it had started, should they still live."""
+    """Kill the supervisor first, so that it restarts no process; then all of its processes that still run."""
     run.kill()
     for pid in running(str(out)):
         with contextlib.suppress(ProcessLookupError):
@@ -108,7 +109,7 @@ def test_a_flight_goes_on_after_everything_was_killed(
         busy = here("run", "--resume", out)
         assert busy.returncode == 2 and "is being written by another process: end that one first" in busy.stderr
         kill_all(run, running, out)
-    assert 40 < records(out) < 3 * 51 and not (out / "tmc.mcap").exists()
+    assert 40 < records(out) < 3 * 51 and not RunFolder(out).journal.exists()
     again = overfly("run", "--resume", out, "--no-pictures")
     assert again.returncode == 0, again.stderr
     assert "Uncertainty" in again.stdout
@@ -153,7 +154,7 @@ def test_training_goes_on_after_everything_was_killed(
     assert check(out).good
 
 
-def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_cannot_be_resumed_gives_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty, anomalies = tmp_path / "empty", tmp_path / "anomalies"
     empty.mkdir()
     anomalies.mkdir()
@@ -177,14 +178,14 @@ def test_what_cannot_go_on_is_said_in_one_sentence(tmp_path: Path, capsys: pytes
     assert list(empty.iterdir()) == []
 
 
-def test_a_training_in_lock_step_is_never_learned_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It leaves no checkpoint: a learner that went on with it would begin with random weights."""
+def test_a_training_in_lock_step_cannot_be_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It leaves no checkpoint, so a learner that resumed it would start with random weights."""
     out, small = tmp_path / "R", ("--ticks", "40", "--episodes", "2", "--set", "replay.learn_start=30", "--no-pictures")
     assert main(["run", "quick", "--lockstep", "--set", "dqn.batch_size=8", *small, "--out", str(out)]) == 0
     policy = (out / "policies" / "final.onnx").read_bytes()
     assert "one, in lock step" in capsys.readouterr().out
-    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0  # it is over: summed up again
-    (out / "run.json").unlink()  # as where it was interrupted
+    assert main(["run", "--resume", str(out), "--no-pictures"]) == 0  # it is over: only analyzed again
+    (out / "run.json").unlink()  # as if it was interrupted
     assert main(["run", "--resume", str(out)]) == 2
     assert "was trained in lock step, which leaves no checkpoint to go on from" in capsys.readouterr().err
     assert (out / "policies" / "final.onnx").read_bytes() == policy
@@ -193,7 +194,7 @@ def test_a_training_in_lock_step_is_never_learned_anew(tmp_path: Path, capsys: p
 
 
 def test_a_run_goes_on_over_its_own_copy_of_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whatever became of the file that it was begun with; but not over a copy that somebody has changed."""
+    """Even if the file that it was started with has changed or is gone; but not if the run's copy was edited."""
     town, out = tmp_path / "town.txt", tmp_path / "R"
     town.write_text("#####\n#...#\n#####\n")
     fly = ("fly", "planner:greedy", "--lockstep", "--actors", "2", "--ticks", "20", "--map", str(town), "--no-pictures")
@@ -219,8 +220,8 @@ def test_the_first_command_of_a_run_is_kept(tmp_path: Path) -> None:
     assert again["command"] == "overfly fly planner:greedy" and len(again["resumed"]) == 1
 
 
-def test_an_empty_config_keeps_nobody_from_going_on(tmp_path: Path) -> None:
-    """It is what a power cut may leave of a file; the journal has a copy."""
+def test_an_empty_config_does_not_prevent_a_resume(tmp_path: Path) -> None:
+    """A power cut may leave an empty file; the journal has a copy of the settings."""
     out = tmp_path / "R"
     assert main(["fly", "planner:greedy", "--lockstep", "--ticks", "60", "--no-pictures", "--out", str(out)]) == 0
     flown = digest(out)
@@ -230,13 +231,13 @@ def test_an_empty_config_keeps_nobody_from_going_on(tmp_path: Path) -> None:
     assert digest(out) == flown and json.loads((out / "config.json").read_text())["training.ticks"] == 60
 
 
-def test_a_damaged_journal_is_gone_on_with_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A bit of the length of a record: the file seems to be cut there, and goes on."""
+def test_a_damaged_journal_is_resumed_and_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One bit of a record's length is flipped: the file seems to be cut there, but continues."""
     out = tmp_path / "R"
     short = ("--lockstep", "--ticks", "60", "--episodes", "4", "--no-pictures")
     assert main(["fly", "planner:greedy", *short, "--out", str(out)]) == 0
     with (out / "tmc.mcap").open("rb") as file:
-        chunks = [at for at, opcode, _ in frames(file) if opcode == Opcode.CHUNK]
+        chunks = [at for at, opcode, _ in strict.records(file) if opcode == Opcode.CHUNK]
     data = bytearray((out / "tmc.mcap").read_bytes())
     data[chunks[0] + 5] ^= 1
     (out / "tmc.mcap").unlink()

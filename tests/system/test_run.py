@@ -1,4 +1,4 @@
-"""`overfly run`: TMC, learner and UAV processes train, end in order, and leave a run folder that tells all."""
+"""`overfly run`: TMC, learner and UAV processes train, end in order, and leave a complete run folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.command import PATIENCE_S, descendants
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 from tmc.record.reader import Log
 
 GREEDY = ("fly", "planner:greedy", "--no-pictures")
@@ -46,7 +46,7 @@ def test_the_learner_draws_one_minibatch_a_tick(here, trained) -> None:
     assert int(last["updates"]) == 90
 
 
-def test_the_log_knows_when_who_sent_something_made_it(trained) -> None:
+def test_the_log_has_the_time_at_which_the_sender_made_a_message(trained) -> None:
     """publish_time: the wall clock of the UAV, of the learner, or of the TMC itself."""
     under_way: dict[str, list[int]] = {}
     for raw in Log(trained(2) / "tmc.mcap").raw():
@@ -133,7 +133,7 @@ def test_a_uav_that_is_killed_comes_back_and_the_run_goes_on(here, running, tmp_
 
 
 def kill_when_up(running: Callable[[str], list[int]], marker: str, out: str, log: Path) -> bool:
-    """SIGKILL the process whose command line holds both texts, once it flies."""
+    """Send SIGKILL to the process whose command line holds both texts, once it flies."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         both = set(running(marker)) & set(running(out))
@@ -200,7 +200,7 @@ def test_processes_fly_what_the_lock_step_fleet_flies(overfly, here, tmp_path: P
 
 @pytest.mark.parametrize("scenario", [1, 2])
 def test_an_outside_simulator_gets_the_same_uncertainty(overfly, here, tmp_path: Path, scenario: int) -> None:
-    """From the CSV of map, moves and events alone: eqs. (1)-(4) and (6), with nothing of ours."""
+    """Recompute eqs. (1)-(4) and (6) from the CSV of map, moves and events alone, without Overfly's code."""
     out = tmp_path / "R"
     assert overfly("fly", "planner:random-road", "--actors", 6, "--ticks", 150, "--scenario", scenario,
                    "--no-pictures", "--out", out).returncode == 0  # fmt: skip

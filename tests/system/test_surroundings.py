@@ -1,4 +1,4 @@
-"""What a parent, a shell or a terminal leaves a command with: ignored signals, closed streams, a locale, files."""
+"""What a command inherits from a parent, a shell or a terminal: ignored signals, closed streams, a locale, files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tests.command import LINE
-from tmc.record.facts import digest
+from tmc.record.queries import digest
 
 FLY = ("fly", "planner:greedy", "--actors", "2", "--ticks", "300", "--no-pictures")
 LONG = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60000", "--episodes", "50", "--no-pictures")
@@ -28,9 +28,9 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Starts `overfly ARGS`, and ends what a test that failed has left.
+    """Return a function that starts `overfly ARGS`; end the processes that a failed test left.
 
-    `before` is called in the new process, as what its parent did to it; `line`: another command than `overfly`.
+    `before` is called in the new process, like a parent's setup. `line`: another command than `overfly`.
     """
     started: list[subprocess.Popen[str]] = []
 
@@ -58,12 +58,12 @@ def until(true: Callable[[], Any], what: str) -> None:
 
 
 def ignore(*numbers: int) -> Callable[[], None]:
-    """A parent that ignores these signals."""
+    """Act as a parent that ignores these signals."""
     return lambda: [signal.signal(number, signal.SIG_IGN) for number in numbers] and None
 
 
 def state(pid: int) -> str:
-    """The letter of a process's state; empty when it is gone."""
+    """Return the letter of a process's state; "" when it has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except OSError:
@@ -71,13 +71,13 @@ def state(pid: int) -> str:
 
 
 def flies(out: Path) -> bool:
-    """Whether the first UAV of a run has begun its log."""
+    """Return whether the first UAV of a run has started its log."""
     return (out / "uav-000.mcap.active").exists() or (out / "uav-000.mcap").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
 def test_a_signal_that_the_parent_ignores_ends_nothing(start, tmp_path: Path, number: signal.Signals) -> None:
-    """nohup, a script's background job; and the processes of the mission still end in order at its end."""
+    """As with nohup, or in a script's background job. The processes of the mission still end in order."""
     out = tmp_path / "R"
     run = start(*FLY, "--ticks", 1500, "--out", out, before=ignore(number))
     until(lambda: flies(out), "the flight")
@@ -103,13 +103,13 @@ def test_every_command_respects_it(start, tmp_path: Path, command: tuple[str, ..
 
 
 def caught(pid: int, number: int) -> bool:
-    """Whether a process has a handler for a signal."""
+    """Return whether a process has a handler for a signal."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return bool(int(next(line.split()[1] for line in lines if line.startswith("SigCgt:")), 16) >> (number - 1) & 1)
 
 
 def test_a_parent_that_ignores_the_end_of_its_children(start, tmp_path: Path) -> None:
-    """With SIGCHLD ignored, the system forgets how a child ended."""
+    """With SIGCHLD ignored, the system does not keep how a child ended."""
     out = tmp_path / "R"
     run = start(*FLY, "--out", out, before=ignore(signal.SIGCHLD))
     _, errors = run.communicate(timeout=PATIENCE_S)
@@ -131,7 +131,7 @@ def test_a_mask_that_the_parent_left_is_taken_off(start, tmp_path: Path) -> None
 
 
 def test_a_terminal_that_closes_ends_the_mission_in_order(start, tmp_path: Path) -> None:
-    """SIGHUP, and then no sentence can be written any more; how each process ended is on the disk all the same."""
+    """After SIGHUP no sentence can be written any more, but how each process ended is on the disk."""
     out = tmp_path / "R"
     ours, its = pty.openpty()
     run = start(*LONG, "--out", out, stdin=its, stdout=its, stderr=its, start_new_session=True)
@@ -187,7 +187,7 @@ def test_a_locale_that_lacks_characters(start, tmp_path: Path, command: tuple[st
 
 
 def test_files_are_read_and_written_in_utf_8_whatever_the_locale(start, tmp_path: Path) -> None:
-    """Python warns, when asked to, wherever a file is opened in the encoding of the locale."""
+    """With an option, Python warns wherever a file is opened in the encoding of the locale."""
     env = os.environ | {"PYTHONWARNDEFAULTENCODING": "1", "PYTHONWARNINGS": "error::EncodingWarning"}
     run = start(*FLY, "--ticks", "20", "--out", tmp_path / "R", env=env)
     _, errors = run.communicate(timeout=PATIENCE_S)
@@ -232,7 +232,7 @@ def test_workers_die_with_an_evaluation_that_is_killed(start, running, tmp_path:
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.3, 0.8])
 def test_ctrl_c_early_leaves_no_traceback(start, running, tmp_path: Path, delay: float) -> None:
-    """In the whole group, as a terminal sends it."""
+    """The whole process group gets the signal, as from a terminal."""
     command = ("evaluate", "planner:greedy", "--seeds", "4000", "--jobs", "2")
     run = start(*command, start_new_session=True)
     until(lambda: caught(run.pid, signal.SIGINT), "the start of Python, which prints a traceback of its own before it")
@@ -261,7 +261,7 @@ def test_ctrl_z_stops_the_mission_and_fg_lets_it_go_on(start, here, running, tmp
 
 
 PR_SET_CHILD_SUBREAPER = 36
-"""Gives a process the place that process 1 has in a container."""
+"""Code that makes a process adopt orphans, as process 1 does in a container."""
 
 
 def test_the_first_process_of_a_container_reaps_what_a_killed_forkserver_leaves(start, running, tmp_path: Path) -> None:
@@ -284,7 +284,7 @@ def test_the_first_process_of_a_container_reaps_what_a_killed_forkserver_leaves(
 
 
 def zombies(parent: int) -> list[int]:
-    """Children of a process that nobody has waited for."""
+    """Return the children of a process that have not been waited for."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -296,7 +296,7 @@ def zombies(parent: int) -> list[int]:
     return found
 
 
-def test_who_waits_for_whom_is_said_on_both_sides(start, tmp_path: Path) -> None:
+def test_both_sides_name_what_they_wait_for(start, tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/s"
     tmc = start("tmc", "--fly", "planner:greedy", "--actors", 2, "--bind", endpoint, "--out", tmp_path / "R")
     uav = start("actor", "--id", 0, "--connect", endpoint, "--out", tmp_path / "U")
@@ -314,7 +314,7 @@ def test_who_waits_for_whom_is_said_on_both_sides(start, tmp_path: Path) -> None
             process.communicate(timeout=PATIENCE_S)
 
 
-def test_a_learner_that_was_refused_holds_nobody_back(start, tmp_path: Path) -> None:
+def test_a_refused_learner_does_not_delay_the_end(start, tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/s"
     tmc = start("tmc", "--fly", "planner:greedy", "--actors", 1, "--ticks", 50, "--bind", endpoint,
                 "--out", tmp_path / "R")  # fmt: skip

@@ -1,4 +1,4 @@
-"""Files for viewers, made of the logs that real processes leave: the same flight gives the same bytes."""
+"""Files for viewers, made from the logs of real processes: the same flight gives the same bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.command import LINE, PATIENCE_S
-from tmc.record.reader import Log, info, run_files
+from tmc.record.reader import Log, info
+from tmc.record.run_folder import run_files
 
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 FLY = ("fly", "planner:greedy", "--actors", 2, "--ticks", 60, "--seed", 5, "--set", "comms.phase=staggered",
@@ -34,7 +35,7 @@ def test_a_team_of_processes_and_lock_step_give_the_same_replay_file(
         assert ours.read_bytes() == theirs.read_bytes()
     merged = here("log", "merge", "P", "--prefix", "P/")
     assert merged.returncode == 0, merged.stderr
-    assert set(run_files(tmp_path / "P")) == {"tmc", "uav-000", "uav-001"}  # no derived file is taken for a log
+    assert set(run_files(tmp_path / "P")) == {"tmc", "uav-000", "uav-001"}  # a derived file does not count as a log
     times = [raw.log_time for raw in Log(tmp_path / "P" / "merged.mcap").raw()]
     assert all(a <= b for a, b in pairwise(times))
     sources: Counter[str] = Counter()
@@ -50,7 +51,7 @@ def test_what_a_killed_mission_leaves_can_be_merged_and_replayed(here: Overfly, 
         log, end = tmp_path / "K" / "tmc.mcap.active", time.monotonic() + PATIENCE_S
         while not (log.is_file() and log.stat().st_size > 30_000) and time.monotonic() < end:
             time.sleep(0.05)
-        os.kill(mission.pid, signal.SIGKILL)  # its children die with it
+        os.kill(mission.pid, signal.SIGKILL)  # its children end with it
     made = here("log", "replay", "K")
     assert made.returncode == 0, made.stderr
     assert "was not flown to its end" in made.stderr

@@ -190,7 +190,7 @@ class Mission:
     def _obey(self, i: int, message: m.Message) -> None:
         pilot, answer = self.pilots[i], None
         if isinstance(message, m.Begin):
-            answer = pilot.begin(message)
+            answer = pilot.on_begin(message)
         elif isinstance(message, m.Map):
             answer = pilot.on_map(message)
         elif isinstance(message, m.Policy):

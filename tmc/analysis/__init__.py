@@ -1,1 +1,1 @@
-"""What a run says: metrics, report and figures, all rebuilt from its log. Only `figures` needs matplotlib."""
+"""Compute, check and draw a run, all from its logs. Only the modules of `report` that draw need matplotlib."""

@@ -1,4 +1,4 @@
-"""The numbers of a run, from its log alone; `tmc.analysis.summary` says what each of them is."""
+"""Compute the metrics of a run from its logs; `tmc.analysis.summary` defines each of them."""
 
 from __future__ import annotations
 
@@ -16,49 +16,50 @@ from tmc.analysis.summary import EpisodeFacts, Health, Mean, Mission, Pace, Summ
 from tmc.kernel.reward import Block
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
+from tmc.record.run_folder import RunFolder
 
-TAIL = 0.1
-"""Share of a training run's episodes, the last ones, whose mean says how well it flies in the end."""
-
-FIXED_POLICY = "policies/flown.onnx"
-"""In a run folder: the policy of a mission that learns nothing."""
+LAST_EPISODES_SHARE = 0.1
+"""Share of a training's episodes, the last ones, whose mean is its result."""
 
 
 def summary(folder: Path) -> Summary:
-    """The summary of a run folder; RecordError when it is none, or when nothing was flown in it."""
+    """Return the summary of a run folder; RecordError when it is not one, or holds no flight."""
     return summarize(read(folder))
 
 
-def summarize(flown: RunData) -> Summary:
-    """The summary of what was read."""
-    world, cells = flown.world, flown.world.law.cells.size
-    facts = tuple(episode_facts(world, episode) for episode in flown.episodes)
+def summarize(run: RunData) -> Summary:
+    """Return the summary of a run."""
+    world, cells = run.world, run.world.law.cells.size
+    facts = tuple(episode_facts(world, episode) for episode in run.episodes)
     whole = [f for f in facts if f.complete] or list(facts)
-    mission = _mission(flown, len(whole) if whole[0].complete else 0)
+    mission = _mission(run, len(whole) if whole[0].complete else 0)
     bound = bound_of(world, whole[-1].ticks)
     moves, blocked = sum(f.moves for f in facts), sum(f.blocked for f in facts)
     return Summary(
-        run=str(flown.folder),
+        run=str(run.folder),
         mission=mission,
         lower_bound=bound,
         lower_bound_per_cell=None if bound is None else bound / cells,
         first=whole[0],
         last=whole[-1],
         best=min(whole, key=lambda f: f.uncertainty),
-        mean=_mean(whole[-max(1, round(TAIL * len(whole))) :] if mission.learning else whole),
+        mean=_mean(whole[-max(1, round(LAST_EPISODES_SHARE * len(whole))) :] if mission.learning else whole),
         moves=moves,
         blocked_grid=sum(f.blocked_grid for f in facts),
         blocked_obstacle=sum(f.blocked_obstacle for f in facts),
         blocked_uav=sum(f.blocked_uav for f in facts),
         blocked_share=blocked / moves if moves else 0.0,
-        pace=_pace(flown, facts),
-        health=_health(flown),
+        pace=_pace(run, facts),
+        health=_health(run),
         episodes=facts,
     )
 
 
 def bound_of(world: World, ticks: int) -> float | None:
-    """What no team can beat in so many ticks (sum over cells): known in scenario II from a visited map only."""
+    """Return a lower bound of the uncertainty of an episode (sum over cells), which no team can beat.
+
+    None where none is known: in scenario I, and where the map does not start visited.
+    """
     config = world.config
     if config.scenario != 2 or config.world.initial_map != "visited":
         return None
@@ -71,10 +72,10 @@ def _bound(alpha: bytes, uavs: int, ticks: int) -> float:
 
 
 def episode_facts(world: World, episode: Episode) -> EpisodeFacts:
-    """The numbers of one episode, of the ticks that the log holds."""
-    mean = _of_known(episode.uncertainty[1:])
+    """Return the metrics of one episode, over the ticks that the log holds."""
+    mean = _known_mean(episode.uncertainty[1:])
     bound, (appeared, cleared, wait) = bound_of(world, episode.ticks), event_facts(world, episode)
-    flown, blocks = episode.cells[1:][episode.cells[1:] != UNKNOWN], episode.blocks
+    cells, blocks = episode.cells[1:][episode.cells[1:] != UNKNOWN], episode.blocks
     visited = np.unique(episode.cells[episode.cells != UNKNOWN])
     return EpisodeFacts(
         episode=episode.number,
@@ -83,12 +84,12 @@ def episode_facts(world: World, episode: Episode) -> EpisodeFacts:
         uncertainty=mean,
         per_cell=mean / world.law.cells.size,
         times_bound=None if bound is None else mean / bound,
-        reward=_of_known(episode.reward[1:]),
+        reward=_known_mean(episode.reward[1:]),
         moves=sum(blocks.values()),
         blocked_grid=blocks.get(Block.GRID, 0),
         blocked_obstacle=blocks.get(Block.OBSTACLE, 0),
         blocked_uav=blocks.get(Block.UAV, 0),
-        on_road=_of_known(world.map.road[flown]),
+        on_road=_known_mean(world.map.road[cells]),
         coverage=float(world.map.road[visited].sum() / world.map.road.sum()),
         events_appeared=appeared,
         events_cleared=cleared,
@@ -98,14 +99,14 @@ def episode_facts(world: World, episode: Episode) -> EpisodeFacts:
     )
 
 
-def _of_known(values: NDArray[Any]) -> float:
-    """The mean of what is known; 0.0 where nothing is, as in an episode whose UAVs were all lost at its start."""
+def _known_mean(values: NDArray[Any]) -> float:
+    """Return the mean without NaN; 0.0 without any value, as in an episode whose UAVs were all lost at its start."""
     known = values[~np.isnan(values)] if values.dtype.kind == "f" else values
     return float(known.mean()) if known.size else 0.0
 
 
 def event_facts(world: World, episode: Episode) -> tuple[int | None, int | None, float | None]:
-    """Events that appeared, those that were cleared, and the mean ticks that these waited; None in scenario II."""
+    """Return the events that appeared, those that were cleared, and their mean wait, ticks; None in scenario II."""
     if world.config.scenario != 1:
         return None, None, None
     waits = event_waits(episode.cells, episode.events)
@@ -114,9 +115,9 @@ def event_facts(world: World, episode: Episode) -> tuple[int | None, int | None,
 
 
 def event_waits(cells: NDArray[np.int64], events: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Shape (E,): ticks from each event (tick, cell) to the next visit of its cell, 0 where none came.
+    """Return the ticks from each event (tick, cell) to the next visit of its cell; 0 without one. Shape (E,), int64.
 
-    An event of tick t is there after the visits of that tick, so a UAV that stands on it clears it at t + 1.
+    An event of tick t appears after the visits of that tick, so a UAV on its cell clears it at t + 1.
     """
     visits: dict[int, list[int]] = {}
     wanted = set(events[:, 1].tolist())
@@ -127,17 +128,17 @@ def event_waits(cells: NDArray[np.int64], events: NDArray[np.int64]) -> NDArray[
 
 
 def _wait(tick: int, visits: list[int]) -> int:
-    place = bisect_right(visits, tick)
-    return visits[place] - tick if place < len(visits) else 0
+    index = bisect_right(visits, tick)
+    return visits[index] - tick if index < len(visits) else 0
 
 
-def _mission(flown: RunData, episodes: int) -> Mission:
-    world, config = flown.world, flown.world.config
-    learning = is_learning(flown)
+def _mission(run: RunData, episodes: int) -> Mission:
+    world, config = run.world, run.world.config
+    learning = is_learning(run)
     fixed = "a fixed policy" if config.team.controller == "policy" else config.team.controller
     return Mission(
-        command=str(flown.outcome.get("command", "")),
-        who="a policy in training" if learning else fixed,
+        command=str(run.outcome.get("command", "")),
+        controller="a policy in training" if learning else fixed,
         learning=learning,
         scenario=config.scenario,
         uavs=config.team.size,
@@ -155,10 +156,10 @@ def _mission(flown: RunData, episodes: int) -> Mission:
     )
 
 
-def is_learning(flown: RunData) -> bool:
-    """True when a learner took part: a policy flew, and not one that was fixed from the start."""
-    learned = "learner" in flown.files or flown.updates > 0
-    return flown.world.config.team.controller == "policy" and (learned or not (flown.folder / FIXED_POLICY).exists())
+def is_learning(run: RunData) -> bool:
+    """True when a learner took part: a policy flew, and it was not fixed from the start."""
+    learned = "learner" in run.files or run.updates > 0
+    return run.world.config.team.controller == "policy" and (learned or not RunFolder(run.folder).fixed_policy.exists())
 
 
 def _mean(facts: Iterable[EpisodeFacts]) -> Mean:
@@ -173,9 +174,9 @@ def _mean(facts: Iterable[EpisodeFacts]) -> Mean:
     )
 
 
-def _pace(flown: RunData, facts: Iterable[EpisodeFacts]) -> Pace:
-    ticks, learning = sum(f.ticks for f in facts), flown.learning
-    updates, seconds = flown.updates, flown.seconds
+def _pace(run: RunData, facts: Iterable[EpisodeFacts]) -> Pace:
+    ticks, learning = sum(f.ticks for f in facts), run.learning
+    updates, seconds = run.updates, run.seconds
     rate = 1.0 / seconds if seconds > 0 else 0.0
     loss, q_mean = _last(learning, "loss"), _last(learning, "q_mean")
     return Pace(round(seconds, 3), ticks, ticks * rate, updates, updates * rate, loss, q_mean)
@@ -186,16 +187,16 @@ def _last(learning: Learning, name: str) -> float | None:
     return float(values[-1]) if values.size and np.isfinite(values[-1]) else None
 
 
-def _health(flown: RunData) -> Health:
+def _health(run: RunData) -> Health:
     def table(name: str) -> dict[str, Any]:
-        found = flown.outcome.get(name)
+        found = run.outcome.get(name)
         return dict(found) if isinstance(found, Mapping) else {}
 
-    paths = flown.files.values()
+    paths = run.files.values()
     return Health(
         exit_codes=table("exit_codes"),
         restarts=table("restarts"),
         log_files=tuple(p.name for p in paths),
         log_bytes=sum(p.stat().st_size for p in paths),
-        notes=flown.notes,
+        notes=run.notes,
     )

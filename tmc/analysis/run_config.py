@@ -1,4 +1,4 @@
-"""The world that a run flew in: the log's copy of settings and map is the truth, whatever became of the files."""
+"""Rebuild the settings and the world of a run. The log's copy counts, even where the files were edited or removed."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from pathlib import Path
 
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, build, differences
-from tmc.kernel.roadmap import COPY, USUAL_CELL_M, MapError, RoadMap, map_of_run, parse_raster
+from tmc.kernel.roadmap import MAP_COPY, USUAL_CELL_M, MapError, RoadMap, map_of_run, parse_raster
 from tmc.kernel.world import World
 from tmc.record.channels import FORMAT
 from tmc.record.errors import RecordError
-from tmc.record.mcap.parser import DamageError, contents
+from tmc.record.mcap.strict import DamageError, contents
 from tmc.record.reader import require_format
+from tmc.record.run_folder import RunFolder
 
 ATTACHED = frozenset(("config.json", "map.csv"))
-"""What the TMC attaches at the start of its log."""
+"""The attachments at the start of the TMC's log."""
 _NO_CONFIG = (ValueError, AttributeError, RecursionError)
-"""What comes of text that is no config: ConfigError is a ValueError, and so is broken JSON."""
+"""Errors of text that is not a config: ConfigError is a ValueError, and so is broken JSON."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a run. `edited`: keys in which `config.json` says something else; `notes`: what is wrong with it.
+    """The settings of a run: the log's copy, or `config.json` where the log has none.
 
-    The log's copy counts, and `config.json` where the log has none.
+    `edited`: keys in which `config.json` differs. `notes`: what is wrong with `config.json`.
     """
 
     config: Config
@@ -34,7 +35,7 @@ class Settings:
 
 
 def world_of(folder: Path, tmc_log: Path) -> tuple[World, list[str]]:
-    """The world, and notes where a file is no longer what was flown with; RecordError without a usable config."""
+    """Return the world, and notes on files that changed since the run; RecordError without a usable config."""
     attached = attachments(tmc_log)
     settings = _settings(folder, attached.get("config.json"))
     road_map, changed = _map(folder, settings.config, attached.get("map.csv"))
@@ -45,12 +46,15 @@ def world_of(folder: Path, tmc_log: Path) -> tuple[World, list[str]]:
 
 
 def settings_of(folder: Path, tmc_log: Path | None) -> Settings:
-    """The settings of a run, whose log may not be there. RecordError where nothing has them."""
+    """Return the settings of a run. `tmc_log` may be None. RecordError when neither log nor folder has them."""
     return _settings(folder, None if tmc_log is None else attachments(tmc_log).get("config.json"))
 
 
 def attachments(tmc_log: Path) -> dict[str, str]:
-    """The text files at the start of the log; reads no further than them. RecordError for a log of another format."""
+    """Return {name: text} of the attachments at the start of the log; nothing behind them is read.
+
+    Raises RecordError for a log of another format.
+    """
     found: dict[str, str] = {}
     try:
         with tmc_log.open("rb") as file:
@@ -62,13 +66,13 @@ def attachments(tmc_log: Path) -> dict[str, str]:
                 if found.keys() >= ATTACHED:
                     break
     except (OSError, DamageError):
-        pass  # whoever reads the messages says so
+        pass  # reported where the messages are read
     return found
 
 
 def _settings(folder: Path, attached: str | None) -> Settings:
-    """The settings, and how `config.json` differs from the log's copy of them."""
-    path = folder / "config.json"
+    """Return the settings, and how `config.json` differs from the log's copy of them."""
+    path = RunFolder(folder).config
     logged = _parsed(attached)
     wrong = f"{folder} has no config.json"
     try:
@@ -83,14 +87,16 @@ def _settings(folder: Path, attached: str | None) -> Settings:
             raise RecordError(f"{wrong}, and its log holds none either: give the folder of a run")
         return Settings(own)
     if own is None:
-        return Settings(logged, notes=(f"{path.name}: no config, the log's is used",) if path.exists() else ())
+        return Settings(
+            logged, notes=(f"{path.name}: not a config; the log's settings are used",) if path.exists() else ()
+        )
     edited = tuple(differences(own, logged))
-    note = f"{path.name}: {', '.join(edited)} changed since the run, the log's settings are used"
+    note = f"{path.name}: {', '.join(edited)} changed since the run; the log's settings are used"
     return Settings(logged, edited, (note,) if edited else ())
 
 
 def _parsed(text: str | None) -> Config | None:
-    """The log's copy of the settings; None where it has none that this Overfly knows."""
+    """Return the log's copy of the settings; None where it has none that this version can read."""
     try:
         return None if text is None else _build(text)
     except _NO_CONFIG:
@@ -102,7 +108,7 @@ def _build(text: str) -> Config:
 
 
 def _map(folder: Path, config: Config, csv: str | None) -> tuple[RoadMap, list[str]]:
-    """The map that was flown over: the log's copy wins over a file that is gone or was edited since."""
+    """Return the map of the run: the log's copy counts where the file is gone or was edited."""
     world = config.world
     try:
         road_map = map_of_run(folder, world.map, world.roads, world.obstacles)
@@ -114,12 +120,15 @@ def _map(folder: Path, config: Config, csv: str | None) -> tuple[RoadMap, list[s
         ]
     if csv is None or road_map.csv() == csv:
         return road_map, []
-    name = COPY if road_map.source and (folder / COPY).exists() else world.map
-    return map_of_csv(world.map, csv, road_map.cell_m), [f"map {name}: changed since the run, the log's is used"]
+    name = MAP_COPY if road_map.source and RunFolder(folder).map_copy.exists() else world.map
+    return map_of_csv(world.map, csv, road_map.cell_m), [f"map {name}: changed since the run; the log's copy is used"]
 
 
 def map_of_csv(name: str, csv: str, cell_m: float = USUAL_CELL_M) -> RoadMap:
-    """The map in the log: `RoadMap.csv` holds neither streets nor rates other than uniform. RecordError."""
+    """Return the map in the log. It has no streets and uniform rates, since `RoadMap.csv` holds neither.
+
+    RecordError when it is not intact.
+    """
     try:
         return parse_raster(f"cell_m: {cell_m!r}\n{csv}", Path(name).stem, "the map in the log")
     except MapError as error:

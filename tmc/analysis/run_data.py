@@ -1,4 +1,4 @@
-"""What was flown: a run folder's logs as arrays, in one pass a file. Finished, still written or cut: what is intact."""
+"""Read the logs of a run into arrays, in one pass per file. Of a file that is cut, what is intact is read."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from tmc.kernel.files import read_text
 from tmc.kernel.world import World
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
-from tmc.record.facts import Tracks
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.queries import Tracks
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import RunFolder, run_files, tmc_log
 
 UNKNOWN = -1
-"""In `Episode.cells`: the log does not say where the UAV was."""
+"""In `Episode.cells`: no record holds the cell of the UAV."""
 Floats = NDArray[np.float64]
 
 
@@ -29,9 +30,12 @@ Floats = NDArray[np.float64]
 class Episode:
     """One episode, as far as the log holds it; T = `training.ticks`, N = `team.size`.
 
-    `cells`: shape (T + 1, N), cell by tick and UAV, or UNKNOWN. `uncertainty`, `reward`: shape (T + 1,), the sum over
-    cells of the true map and the mean of the team by tick, NaN where the log has none. `events`: shape (E, 2), tick and
-    cell of each. `blocks`: moves by `Block`. `epsilon`, `updates` (so far): None before the episode's end.
+    `cells`: shape (T + 1, N), cell by tick and UAV, or UNKNOWN.
+    `uncertainty`: shape (T + 1,), of the true map, summed over cells, by tick; NaN where the log has none.
+    `reward`: shape (T + 1,), mean per UAV, by tick; NaN where the log has none.
+    `events`: shape (E, 2), tick and cell of each.
+    `blocks`: number of moves by `Block`.
+    `epsilon`, `updates` (so far): None before the end of the episode.
     """
 
     number: int
@@ -45,7 +49,7 @@ class Episode:
 
     @property
     def ticks(self) -> int:
-        """Ticks, from 1 on, whose uncertainty is known."""
+        """The number of ticks from 1 on whose uncertainty is known."""
         return int(np.isfinite(self.uncertainty[1:]).sum())
 
     @property
@@ -56,7 +60,7 @@ class Episode:
 
 @dataclass(frozen=True, eq=False)
 class Learning:
-    """How learning went, by update: arrays of one length; `q_mean`, `target_mean` are NaN where only the TMC logged."""
+    """The learner's metrics, by update; shapes (U,). `q_mean`, `target_mean` are NaN where only the TMC logged."""
 
     updates: NDArray[np.int64]
     loss: Floats
@@ -66,10 +70,11 @@ class Learning:
 
 @dataclass(frozen=True, eq=False)
 class RunData:
-    """A run. `updates`: of the network, as far as any log says. `outcome`: run.json, empty without one.
+    """A run, read.
 
-    `seconds`: how long its processes were at work, by a clock that is never set, without the time between them.
-    `notes`: sentences on what is wrong with the logs; empty when all were closed in order.
+    `updates`: of the network, by the log that holds most. `seconds`: working time of its processes, by a monotonic
+    clock, without the time between incarnations. `files`: {process: log}. `outcome`: run.json, empty without one.
+    `notes`: what is wrong with the logs, one sentence each; empty when all were closed in order.
     """
 
     folder: Path
@@ -83,7 +88,7 @@ class RunData:
     notes: tuple[str, ...]
 
     def episode(self, number: int) -> Episode:
-        """One episode; RecordError when the log has nothing of it."""
+        """Return one episode; RecordError when the log holds nothing of it."""
         for episode in self.episodes:
             if episode.number == number:
                 return episode
@@ -92,26 +97,24 @@ class RunData:
 
 
 def read(folder: Path) -> RunData:
-    """Read a run folder; RecordError when it is none, or when nothing was flown in it."""
+    """Read a run folder; RecordError when it is not one, or holds no flight."""
     files = run_files(folder)
-    if "tmc" not in files:
-        raise RecordError(f"{folder} holds no tmc.mcap: give the folder of the run on the host where the TMC ran")
-    world, notes = world_of(folder, files["tmc"])
-    gathered = _Gathered()
+    world, notes = world_of(folder, tmc_log(folder))
+    collector = _Collector()
     for path in files.values():
-        notes += gathered.take(path)
-    episodes = gathered.episodes(world)
+        notes += collector.read(path)
+    episodes = collector.episodes(world)
     if not episodes:
-        raise RecordError(f"{folder} holds no flight: its mission ended before the first records came in")
-    span = max(gathered.flying.total, gathered.learning.total)
-    learning = _learning(gathered.learner or gathered.policies)
-    return RunData(folder, world, episodes, learning, gathered.updates, span, files, _outcome(folder), tuple(notes))
+        raise RecordError(f"{folder} holds no flight: its mission ended before the first flight records arrived")
+    span = max(collector.flying.total, collector.learning.total)
+    learning = _learning(collector.learner or collector.policies)
+    return RunData(folder, world, episodes, learning, collector.updates, span, files, _outcome(folder), tuple(notes))
 
 
 def _outcome(folder: Path) -> dict[str, Any]:
-    """run.json; empty where there is none, or none yet that is whole."""
+    """Return run.json; empty where there is none, or an incomplete one."""
     try:
-        found = json.loads(read_text(folder / "run.json"))
+        found = json.loads(read_text(RunFolder(folder).outcome))
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -119,26 +122,26 @@ def _outcome(folder: Path) -> dict[str, Any]:
 
 @dataclass
 class Elapsed:
-    """Seconds that one process after the other was at work, each counting its own from 0."""
+    """Add up the working time of the incarnations of a process, s. Each counts its own from 0."""
 
     before: float = 0.0
     last: float = 0.0
 
-    def take(self, seconds: float) -> None:
-        """One process's seconds so far; fewer than before are those of the next process."""
+    def update(self, seconds: float) -> None:
+        """Note the time of the current incarnation, s. A time that goes back is that of the next one."""
         if seconds < self.last:
             self.before += self.last
         self.last = seconds
 
     @property
     def total(self) -> float:
-        """Of all processes."""
+        """The time of all incarnations, s."""
         return self.before + self.last
 
 
 @dataclass
-class _Gathered:
-    """Messages of a run as they come, sorted by episode; repeats are dropped."""
+class _Collector:
+    """Sort the messages of a run by episode, and drop repeats."""
 
     tracks: dict[int, Tracks] = field(default_factory=dict)
     blocks: dict[int, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
@@ -152,11 +155,11 @@ class _Gathered:
     flying: Elapsed = field(default_factory=Elapsed)
     learning: Elapsed = field(default_factory=Elapsed)
 
-    def take(self, path: Path) -> list[str]:
-        """Read one file; returns what is wrong with it."""
+    def read(self, path: Path) -> list[str]:
+        """Read one file; return what is wrong with it."""
         try:
             log = Log(path)
-        except RecordError as error:  # empty, or no log at all: the rest of the run is still worth reading
+        except RecordError as error:  # empty, or not a log: the rest of the run can still be read
             return [str(error)]
         for raw in log.raw():
             handler = _HANDLERS.get(raw.schema)
@@ -164,7 +167,7 @@ class _Gathered:
                 handler(self, decode(raw))
         if log.damage:
             return [log.damage]
-        still = f"{path.name}: not closed, so the mission goes on or its process was killed"
+        still = f"{path.name}: not closed: its process is still running, or was killed"
         return [still] if path.name.endswith(ACTIVE) and not log.finished else []
 
     def _record(self, m: Any) -> None:
@@ -175,7 +178,7 @@ class _Gathered:
 
     def _metrics(self, m: Any) -> None:
         self.updates = max(self.updates, m.updates)
-        self.flying.take(m.elapsed)
+        self.flying.update(m.elapsed)
         self.metrics[m.episode].append(m)
 
     def _events(self, m: Any) -> None:
@@ -188,7 +191,7 @@ class _Gathered:
 
     def _learner(self, m: Any) -> None:
         self.updates = max(self.updates, m.updates)
-        self.learning.take(m.wall)
+        self.learning.update(m.wall)
         self.learner[m.updates] = (m.loss, m.q_mean, m.target_mean)
 
     def _policy(self, m: Any) -> None:
@@ -197,16 +200,16 @@ class _Gathered:
             self.policies[m.updates] = (m.loss, np.nan, np.nan)
 
     def episodes(self, world: World) -> tuple[Episode, ...]:
-        """Those of which at least one tick was flown by all UAVs."""
-        found = (self._made(number, world) for number in sorted(self.tracks))
+        """Return the episodes of which at least one tick is final for all UAVs."""
+        found = (self._episode_of(number, world) for number in sorted(self.tracks))
         return tuple(episode for episode in found if episode.ticks)
 
-    def _made(self, number: int, world: World) -> Episode:
+    def _episode_of(self, number: int, world: World) -> Episode:
         end, T = self.ends.get(number), world.config.training.ticks
         uncertainty, reward = np.full(T + 1, np.nan), np.full(T + 1, np.nan)
         for m in self.metrics[number]:
             span = slice(m.first, m.first + len(m.uncertainty))
-            _fits(world, span.stop <= T + 1)
+            _require(world, span.stop <= T + 1)
             uncertainty[span], reward[span] = m.uncertainty, m.reward
         return Episode(
             number,
@@ -220,28 +223,28 @@ class _Gathered:
         )
 
 
-_HANDLERS: dict[str, Callable[[_Gathered, Any], None]] = {
-    "overfly.FlightRecord": _Gathered._record,
-    "overfly.TeamMetrics": _Gathered._metrics,
-    "overfly.Events": _Gathered._events,
-    "overfly.Episode": _Gathered._episode,
-    "overfly.LearnerMetrics": _Gathered._learner,
-    "overfly.Policy": _Gathered._policy,
+_HANDLERS: dict[str, Callable[[_Collector, Any], None]] = {
+    "overfly.FlightRecord": _Collector._record,
+    "overfly.TeamMetrics": _Collector._metrics,
+    "overfly.Events": _Collector._events,
+    "overfly.Episode": _Collector._episode,
+    "overfly.LearnerMetrics": _Collector._learner,
+    "overfly.Policy": _Collector._policy,
 }
 
 
 def _cells(tracks: Tracks, world: World) -> NDArray[np.int64]:
-    """Shape (T + 1, N), UNKNOWN where there is no record."""
+    """Return the cells by tick and UAV, UNKNOWN without a record; shape (T + 1, N)."""
     T, N, K = world.config.training.ticks, world.config.team.size, world.grid.size
     ticks, uavs, cells = tracks.rows().astype(np.int64).T
-    _fits(world, bool((ticks <= T).all() and (uavs < N).all() and (cells < K).all()))
+    _require(world, bool((ticks <= T).all() and (uavs < N).all() and (cells < K).all()))
     table = np.full((T + 1, N), UNKNOWN, np.int64)
     table[ticks, uavs] = cells
     return table
 
 
-def _fits(world: World, good: bool) -> None:
-    if not good:
+def _require(world: World, fits: bool) -> None:
+    if not fits:
         team, ticks = world.config.team.size, world.config.training.ticks
         raise RecordError(
             f"the log does not fit its config of {team} UAVs, {ticks} ticks and {world.grid.size} cells: "
@@ -250,7 +253,7 @@ def _fits(world: World, good: bool) -> None:
 
 
 def _learning(by_update: Mapping[int, Iterable[float]]) -> Learning:
-    """A learner that came back from a checkpoint did some updates twice: the last time counts."""
+    """Sort by update. A learner that resumed from a checkpoint did some updates twice: the last time counts."""
     updates = np.array(sorted(by_update), np.int64)
     values = np.array([tuple(by_update[int(u)]) for u in updates], np.float64).reshape(-1, 3)
     return Learning(updates, values[:, 0], values[:, 1], values[:, 2])

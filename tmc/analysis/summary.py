@@ -1,7 +1,7 @@
-"""What a run comes to, in numbers: one frozen `Summary`, from the log alone.
+"""The metrics of a run: one frozen `Summary`.
 
-Uncertainties are eq. (6): the sum over cells of the true map's uncertainty, averaged over ticks 1..T (scenario I: the
-number of active events). A tick is a minute of simulated time. None stands for what the run does not have.
+Uncertainties are eq. (6): of the true map, summed over cells, averaged over ticks 1..T; in scenario I, the number of
+active events. A tick is 60 s of simulated time. A value that the run does not have is None.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 
 @dataclass(frozen=True)
 class Mission:
-    """What was to be flown. `who`: planner, fixed policy, or the policy in training; `T_u`, `ticks`: ticks."""
+    """The mission. `controller`: planner, fixed policy, or the policy in training; `T_u`, `ticks`: ticks."""
 
     command: str
-    who: str
+    controller: str
     learning: bool
     scenario: int
     uavs: int
@@ -34,10 +34,12 @@ class Mission:
 
 @dataclass(frozen=True)
 class EpisodeFacts:
-    """One episode. `uncertainty`: sum over cells; `per_cell`: by monitored cell; `times_bound`: over the lower bound.
+    """The metrics of one episode.
 
-    `reward`: a UAV a tick. `moves`, `blocked_*`: of all UAVs. `on_road`: share of the UAVs' ticks over road;
-    `coverage`: share of the road cells visited. `events_*`, `mean_wait` (ticks until cleared): scenario I only.
+    `uncertainty`: summed over cells; `per_cell`: per monitored cell; `times_bound`: relative to the lower bound.
+    `reward`: mean per UAV per tick. `moves`, `blocked_*`: of all UAVs.
+    `on_road`: share of the UAVs' ticks over road, 0 to 1; `coverage`: share of the road cells visited, 0 to 1.
+    `events_*`, `mean_wait` (ticks until cleared): scenario I only.
     """
 
     episode: int
@@ -61,13 +63,13 @@ class EpisodeFacts:
 
     @property
     def blocked(self) -> int:
-        """Blocked moves of all causes."""
+        """The number of blocked moves, all causes."""
         return self.blocked_grid + self.blocked_obstacle + self.blocked_uav
 
 
 @dataclass(frozen=True)
 class Mean:
-    """Mean over the last `episodes` episodes: in training the last tenth, otherwise all."""
+    """Means over the last `episodes` episodes: in training the last tenth, otherwise all."""
 
     episodes: int
     uncertainty: float
@@ -78,9 +80,9 @@ class Mean:
 
 @dataclass(frozen=True)
 class Pace:
-    """`seconds`: how long the processes were at work, by a clock that is never set.
+    """How fast the run was. `seconds`: working time of the processes, by a monotonic clock.
 
-    `ticks` of the team, `updates` of the network.
+    `ticks`: of the team. `updates`: of the network. `loss`, `q_mean`: the last ones logged.
     """
 
     seconds: float
@@ -94,7 +96,7 @@ class Pace:
 
 @dataclass(frozen=True)
 class Health:
-    """Exit codes and restarts by process, from run.json; the size of the logs, and what is wrong with them."""
+    """Exit codes and restarts by process, from run.json; size of the logs, bytes; what is wrong with the logs."""
 
     exit_codes: dict[str, int | None]
     restarts: dict[str, int]
@@ -105,7 +107,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Summary:
-    """A run. `first`, `last`, `best` are complete episodes (where there is one); the bound is None where unknown."""
+    """The metrics of a run. `first`, `last`, `best`: complete episodes, if any. An unknown bound is None."""
 
     run: str
     mission: Mission
@@ -126,9 +128,9 @@ class Summary:
 
     @property
     def blocked(self) -> int:
-        """Blocked moves of all causes, in the whole run."""
+        """The number of blocked moves in the run, all causes."""
         return self.blocked_grid + self.blocked_obstacle + self.blocked_uav
 
     def to_json(self) -> str:
-        """All of it as JSON."""
+        """Return the summary as JSON."""
         return json.dumps(asdict(self), indent=1, allow_nan=False)

@@ -1,4 +1,4 @@
-"""Journal entries: what the station wants logged, as the fields of the log's schemas (docs/log-format.md)."""
+"""Journal entries: what the station wants logged, as the fields of the log's schemas."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from tmc.wire.messages import Record
 
 @dataclass(frozen=True)
 class JournalEntry:
-    """A journal entry: the topic, and the fields of its schema. `sent`: the wall clock of whoever sent it, in ns; 0
-    where that is the TMC."""
+    """Hold the topic and the fields of its schema. `sent`: the sender's wall clock (ns); 0 if the TMC is the sender."""
 
     topic: str
     values: dict[str, Any]
@@ -26,12 +25,12 @@ class JournalEntry:
 
 
 def flight_record(record: Record) -> JournalEntry:
-    """A record that was accepted."""
+    """Return the entry of a record that was accepted."""
     return JournalEntry(uav_topic(record.uav, "record"), {"record": record}, record.sent)
 
 
 def exchange(episode: EpisodeState, done: Exchange, policy: int) -> list[JournalEntry]:
-    """An exchange: who was answered, and in scenario II the map that they got, over all K cells."""
+    """Return the entries of an exchange: the UAVs answered, and in scenario II the map they got, over all K cells."""
     values = {
         "episode": episode.number, "tick": done.tick, "version": done.version, "policy": policy,
         "uavs": done.uavs, "believed": done.believed,
@@ -44,8 +43,8 @@ def exchange(episode: EpisodeState, done: Exchange, policy: int) -> list[Journal
     return [sync, JournalEntry("/tmc/last_visit", {"last_visit": whole})]
 
 
-def truth(episode: EpisodeState, fresh: FinalTicks, steps: int, updates: int, policy: int) -> list[JournalEntry]:
-    """What became final: uncertainty and mean reward by tick, and in scenario I the new events."""
+def final_ticks(episode: EpisodeState, fresh: FinalTicks, steps: int, updates: int, policy: int) -> list[JournalEntry]:
+    """Return the entries of final ticks: uncertainty and mean reward by tick, and in scenario I the new events."""
     values = {
         "episode": episode.number, "first": fresh.first, "steps": steps, "updates": updates, "policy": policy,
         "uncertainty": fresh.uncertainty, "reward": fresh.reward,
@@ -59,18 +58,18 @@ def truth(episode: EpisodeState, fresh: FinalTicks, steps: int, updates: int, po
 
 
 def lost(episode: EpisodeState, uav: int) -> JournalEntry:
-    """A UAV that the team goes on without."""
+    """Return the entry of a UAV that the team goes on without."""
     return JournalEntry("/tmc/lost", {"episode": episode.number, "uav": uav, "tick": episode.lost[uav]})
 
 
 def state(episode: EpisodeState, replay: Replay) -> JournalEntry:
-    """What the TMC holds at the end of an episode: digests that whoever plays the journal must get as well."""
+    """Return the digests of the TMC's state at an episode's end; playing the journal must give the same."""
     values = {"episode": episode.number, "map": episode.digest(), "replay": replay.digest(), "transitions": len(replay)}
     return JournalEntry("/tmc/state", values)
 
 
 def episode(episode: EpisodeState, phase: str, epsilon: float, steps: int, updates: int) -> JournalEntry:
-    """The begin of an episode with its starts, or its end with its sums."""
+    """Return the entry of an episode's begin with its starts, or of its end with its sums."""
     mean = episode.total_uncertainty / episode.T
     return JournalEntry("/tmc/episode", {
         "episode": episode.number, "phase": phase, "starts": episode.starts, "ticks": max(episode.done, 0),
@@ -82,7 +81,7 @@ def episode(episode: EpisodeState, phase: str, epsilon: float, steps: int, updat
 
 
 def policy(version: int, updates: int, loss: float, model: bytes, sent: int, *, last: bool) -> JournalEntry:
-    """A policy that was accepted; only the mission's last one with its model, since thousands of them may come."""
+    """Return the entry of an accepted policy; only the mission's last one has its model, as there may be thousands."""
     digest = hashlib.sha256(model).hexdigest()
     values = {"version": version, "updates": updates, "sha256": digest, "loss": loss, "model": model if last else b""}
     return JournalEntry("/learner/policy", values, sent)

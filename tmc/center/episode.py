@@ -1,8 +1,8 @@
-"""One episode as the TMC sees it: records in, map answers out, and the truth, tick by tick, once all have reported.
+"""One episode as the TMC sees it: flight records in, map answers out, and final ticks once all UAVs have reported.
 
-Two clocks run here. The *exchange* clock visits the ticks at which somebody is due, in order: an exchange is answered
-when every record due by then is in, so the answer does not depend on who was faster. The *truth* clock follows the
-slowest UAV: only when all have reported a tick are its visits, rewards and uncertainty final and given to the replay.
+Two ticks advance here. The *exchange tick* visits the ticks at which a UAV is due, in order. An exchange is answered
+when every record due by then is in, so the answer does not depend on which UAV was faster. The *final tick* follows the
+slowest UAV. Once all UAVs have reported a tick, its visits, rewards and uncertainty are final and go to the replay.
 """
 
 from __future__ import annotations
@@ -22,20 +22,22 @@ from tmc.kernel.world import World
 from tmc.wire.messages import EMPTY, Begin, Map, Record
 
 NO_CELL = 65_535
-"""Stands for the cell of a UAV that was lost, in the ticks after its last record."""
+"""The cell of a UAV that was lost, in the ticks after its last record."""
 MAX_TICKS_AT_ONCE = 64
-"""Ticks that are reckoned at once, at most."""
+"""Ticks that are computed at once, at most."""
 _UAV = int(Block.UAV)
 
 
 class RefusedError(ValueError):
-    """A record that cannot be true; nothing was changed by it."""
+    """A record cannot be true. It has changed nothing."""
 
 
 @dataclass(frozen=True)
 class FinalTicks:
-    """What became final, one entry a tick from `first` on: sum_k u_k, the UAVs that were there and the mean of their
-    rewards; and the events (tick, cell)."""
+    """Hold what became final, with one entry per tick from `first` on.
+
+    `uncertainty`: sum_k u_k; `present`: number of UAVs; `reward`: mean of their rewards; `events`: (tick, cell) pairs.
+    """
 
     first: int
     uncertainty: list[float]
@@ -46,7 +48,7 @@ class FinalTicks:
 
 @dataclass(frozen=True)
 class Exchange:
-    """The exchange at `tick`: the UAVs that are answered, and the map that they get, as it was at that tick.
+    """Hold the exchange at `tick`: the UAVs that are answered, and the map that they get, as it was at that tick.
 
     `last_visit` (R,) u16 in scenario II, `active` u16 cells in scenario I; `believed`: its uncertainty, summed.
     """
@@ -60,7 +62,7 @@ class Exchange:
 
 
 class EpisodeState:
-    """The state of one episode. `version` numbers the maps of the whole mission, on from episode to episode."""
+    """Hold the state of one episode. `version` numbers the maps of the whole mission, across episodes."""
 
     def __init__(self, world: World, reward: RewardLaw, replay: Replay, number: int, version: int) -> None:
         config = world.config
@@ -78,19 +80,19 @@ class EpisodeState:
         self.own_rewards = np.zeros((self.T + 1, self.N), "<f4")
         self.base = np.zeros((self.T + 1, self.N), np.int64)
         self._values = np.full((self.T + 1, self.N, 2), np.nan, "<f4") if config.replay.priority_exponent else None
-        """Q(o_t, a_t) and max_a Q(o_t, a), by the tick t of the decision, as the UAVs reckoned them."""
+        """Q(o_t, a_t) and max_a Q(o_t, a), by the tick t of the decision, as the UAVs computed them."""
         self._prioritised = 0
         self.reported = [-1] * self.N
         self.lost: dict[int, int] = {}
         """Lost UAVs, and the tick of their last record."""
         self.cells[0] = self.starts
-        # The exchange clock: what the TMC believes, and what it knows each UAV to believe.
+        # Up to the exchange tick: what the TMC believes, and what it knows each UAV to believe.
         self.version = version
         self.next_exchange = 0
         self.believed = np.zeros(R, "<u2")
         self.beliefs = np.zeros((self.N, R), "<u2")
         self.given = [version] * self.N  # the map that each UAV was answered with last
-        # The truth clock: final up to `done`.
+        # The final tick is `done`.
         self.done = -1
         self.last_visit = np.zeros(R, "<u2")
         self.active = np.zeros(K, bool)
@@ -105,11 +107,11 @@ class EpisodeState:
 
     @property
     def over(self) -> bool:
-        """All ticks are final and answered, or nobody is left to fly them."""
+        """Return True when all ticks are final and answered, or no UAV is left to fly them."""
         return self.done == self.T and (self.next_exchange > self.T or len(self.lost) == self.N)
 
     def accept(self, record: Record) -> None:
-        """Take a UAV's next record; raises RefusedError when it does not follow from what is known."""
+        """Accept a UAV's next record. Raises RefusedError if it does not follow from what is known."""
         i, first, last = record.uav, record.first, record.tick
         self._check(record)
         moves = slice(max(first, 1), last + 1)
@@ -151,9 +153,9 @@ class EpisodeState:
             raise RefusedError(f"record of UAV {r.uav} has a sighting off the grid")
 
     def _check_path(self, r: Record) -> None:
-        """Every cell follows from the one before by the action, or is the same where the move was blocked.
+        """Check that every cell follows from the one before by its action, or is the same if the move was blocked.
 
-        Plain lists: a record has some ten moves, for which NumPy's calls cost several times as much.
+        Uses plain lists: a record has some ten moves, for which NumPy's calls cost several times as much.
         """
         cells, moves = r.cells.tolist(), self.world.moves
         if r.first == 0 and cells[0] != self.starts[r.uav]:
@@ -170,7 +172,7 @@ class EpisodeState:
             here = cell
 
     def _why_not(self, cell: int, due: int, block: int) -> str:
-        """What is wrong with a move to `cell` that should have led to `due`."""
+        """Return what is wrong with a move to `cell` that should have led to `due`."""
         if cell >= self.world.grid.size or self.world.map.blocked[cell]:
             return "has a cell off the grid or on an obstacle"
         if cell != due or not block:
@@ -178,7 +180,7 @@ class EpisodeState:
         return "says that a move was blocked by what is not there"
 
     def exchanges(self) -> list[Exchange]:
-        """Run the exchange clock as far as the records allow; one entry for each that could be held."""
+        """Hold all exchanges that the records allow, and return them."""
         done = []
         while self.next_exchange <= self.T:
             t = self.next_exchange
@@ -193,7 +195,7 @@ class EpisodeState:
         return done
 
     def due(self, t: int) -> list[int]:
-        """The UAVs that ship a record at tick t."""
+        """Return the UAVs that ship a record at tick t."""
         due = range(self.N) if t == self.T else self._due[t % self.world.config.T_u]
         return [i for i in due if i not in self.lost]
 
@@ -217,7 +219,7 @@ class EpisodeState:
         return Exchange(t, self.version, due, believed, self.believed.copy(), EMPTY)
 
     def _apply_visits(self, i: int, t: int) -> None:
-        """UAV i's visits up to t, all reported by now, into the map that the TMC believes."""
+        """Enter UAV i's visits up to t, all reported by now, into the map that the TMC believes."""
         index, believed, first = self.world.law.index_list, self.believed, max(t - self.world.config.T_u, 0)
         for tick, cell in enumerate(self.cells[first : t + 1, i].tolist(), first):
             k = index[cell]
@@ -225,35 +227,41 @@ class EpisodeState:
                 believed[k] = tick
 
     def answer(self, exchange: Exchange, policy: int, sequence: int, acknowledged: int) -> Map:
-        """The TMC's answer at an exchange to record `sequence`; those below `acknowledged` are journalled for good."""
+        """Return the answer to record `sequence` at an exchange; records below `acknowledged` are committed."""
         last_visit, active = exchange.last_visit, exchange.active
-        return Map(self.number, exchange.tick, exchange.version, policy, sequence, acknowledged, last_visit, active)
+        return Map(
+            episode=self.number, tick=exchange.tick, version=exchange.version, policy=policy, sequence=sequence,
+            acknowledged=acknowledged, last_visit=last_visit, active=active,
+        )  # fmt: skip
 
     def begin(self, i: int, policy: int, sequence: int) -> Begin:
-        """Fly from the last record that the TMC has of UAV i; at the start of the episode, from its beginning."""
+        """Return the order to fly on from UAV i's last record, or from the episode's beginning if there is none."""
         shipped, lost, tick = self.reported[i], np.array([*self.lost], "<u2"), max(self.reported[i], 0)
         belief, track = self.beliefs[i].copy(), self.cells[: tick + 1, i].copy()
-        return Begin(self.number, tick, shipped, sequence, self.given[i], policy, belief, track, lost)
+        return Begin(
+            episode=self.number, tick=tick, shipped=shipped, sequence=sequence, version=self.given[i], policy=policy,
+            last_visit=belief, track=track, lost=lost,
+        )  # fmt: skip
 
     def uncertainty(self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64]) -> NDArray[np.float64]:
-        """u_k(t) over the monitored cells, scenario II; shapes as in `UncertaintyLaw.values`."""
+        """Return u_k(t) of the monitored cells in scenario II; shapes as in `UncertaintyLaw.values`."""
         return self.world.law.values(last_visit, t, self.factor)
 
     def finalise(self) -> FinalTicks:
-        """Run the truth clock up to the slowest UAV; returns what became final since the last call."""
+        """Advance the final tick to the slowest UAV's; return what became final since the last call."""
         self._finalise(min((t for i, t in enumerate(self.reported) if i not in self.lost), default=self.T))
-        truth, self._fresh = self._fresh, FinalTicks(self.done + 1, [], [], [], [])
-        ticks = slice(truth.first, self.done + 1)
-        if truth.uncertainty:
-            sure = [self._sure(t) for t in range(truth.first, self.done + 1)]
+        final, self._fresh = self._fresh, FinalTicks(self.done + 1, [], [], [], [])
+        ticks = slice(final.first, self.done + 1)
+        if final.uncertainty:
+            sure = [self._sure(t) for t in range(final.first, self.done + 1)]
             rows = (self.cells[ticks], self.actions[ticks], self.rewards[ticks], self.base[ticks])
-            self.replay.add_rows(self.number, truth.first, *rows, sure)
+            self.replay.add_rows(self.number, final.first, *rows, sure)
             if self._values is not None:
                 self._set_initial_priorities(self._values)
-        return truth
+        return final
 
     def _set_initial_priorities(self, values: NDArray[np.float32]) -> None:
-        """First priorities (Horgan et al. 2018, Sec. 3) of the transitions for which the values are final by now.
+        """Set the first priorities (Horgan et al. 2018, Sec. 3) of transitions whose values are final by now.
 
         A transition from t needs max_a Q(o_{t+1}, a), which comes with the move from t + 1: the last one of an episode
         has none. With n-step sums the 1-step error stands for that of the whole transition.
@@ -265,24 +273,27 @@ class EpisodeState:
         self.replay.set_initial_errors(self.replay.rows_in - 1 - self.done + first, errors)
 
     def _sure(self, t: int) -> bool:
-        """False for the ticks at which nobody knows whom a lost UAV was seen by: until its next exchange it may have
-        been seen, and that seeing remembered until the exchange after it. And where nobody is left."""
+        """Return False for the ticks at which a peer may have sensed a lost UAV without a record of it.
+
+        It may have been sensed until its next exchange, and the peer may have remembered that until the exchange after.
+        Also False if no UAV is left.
+        """
         lost, long = self.lost.values(), 2 * self.world.config.T_u
         return bool(self.present(t)) and not any(last < t <= last + long for last in lost)
 
     def lose(self, uav: int) -> int:
-        """Go on without a UAV: its visits count up to its last record, the tick of which is returned."""
+        """Go on without a UAV, whose visits count up to its last record; return the tick of that record."""
         last = self.lost[uav] = self.reported[uav]
         self.cells[last + 1 :, uav] = NO_CELL
         return last
 
     def digest(self) -> str:
-        """BLAKE2b, hex, of the global map: the true one, the one that the TMC believes, and what each UAV believes."""
+        """Return the BLAKE2b digest (hex) of the true map, the one that the TMC believes, and the UAVs' beliefs."""
         maps = (self.last_visit, self.active, self.believed, self.beliefs)
         return hashlib.blake2b(b"".join(a.tobytes() for a in maps), digest_size=16).hexdigest()
 
     def present(self, t: int) -> list[tuple[int, int]]:
-        """(uav, cell) of those who were not lost at tick t."""
+        """Return (uav, cell) of the UAVs that were not lost at tick t."""
         return [(i, cell) for i, cell in enumerate(self.cells[t].tolist()) if cell != NO_CELL]
 
     def _finalise(self, upto: int) -> None:
@@ -290,7 +301,7 @@ class EpisodeState:
             self._finalise_ticks(range(self.done + 1, min(self.done + MAX_TICKS_AT_ONCE, upto) + 1))
 
     def _finalise_ticks(self, ticks: range) -> None:
-        """These ticks are final; the map's uncertainty is reckoned for all of them at once."""
+        """Make these ticks final; the map's uncertainty is computed for all of them at once."""
         fresh, maps = self._fresh, np.empty((len(ticks), self.last_visit.size), "<u2")
         sums = []
         for t in ticks:
@@ -309,7 +320,7 @@ class EpisodeState:
             self.total_uncertainty += u
 
     def _visit(self, t: int, present: list[tuple[int, int]]) -> list[float]:
-        """Rewards of the UAVs that are there at tick t (Sec. III-B), then the visits of that tick."""
+        """Return the rewards of the present UAVs at tick t (Sec. III-B), then enter the visits of that tick."""
         index, blocks, last_visit, rewards = self.world.law.index_list, self.blocks[t].tolist(), self.last_visit, []
         for i, cell in present:
             k, visited = index[cell], self.visited[i]
@@ -328,7 +339,7 @@ class EpisodeState:
         return rewards
 
     def _reward(self, t: int, i: int, cell: int, k: int, block: int) -> float:
-        """By the true map, or as the UAV reckoned it; with novelty for the UAV, or for the team."""
+        """Return the reward by the true map, or as the UAV computed it; with novelty for the UAV or for the team."""
         if block:
             return self._rules.collision
         novel = cell not in self.visited[i]
@@ -342,7 +353,7 @@ class EpisodeState:
         return self.reward(False, counted, k, self.world.law.value(k, self.last_visit.item(k), t, self.factor))
 
     def _events(self, t: int, present: list[tuple[int, int]]) -> float:
-        """Scenario I: what was visited is cleared and the events of the slot come in; sum_k e_k(t)."""
+        """Clear the visited cells and add the events of the slot (scenario I); return sum_k e_k(t)."""
         if t:
             arrivals = self.world.arrivals(self.number, t)
             self.active, new = step_events(self.active, [cell for _, cell in present], arrivals)

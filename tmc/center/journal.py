@@ -1,7 +1,7 @@
-"""Writes what the station wants journalled into the TMC's MCAP file, and commits it a group at a time.
+"""The TMC's journal: what the station wants recorded, written to its MCAP file and committed in groups.
 
-What is committed survives what `journal.durability` says. Policy files are too large for a journal of thousands of
-them: those still in use lie beside it, in `policies/`, and the journal has their digests.
+What is committed survives what `journal.durability` says. Policy files would make the journal too large: those in use
+lie beside it, in `policies/`, and the journal has their digests.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from tmc.center.roster import Outbox
 from tmc.kernel.config import flat
 from tmc.kernel.world import World
 from tmc.record import builders
-from tmc.record.channels import ACTIVE, CHANNELS
-from tmc.record.disk import put
+from tmc.record.channels import CHANNELS
+from tmc.record.disk import write_atomically
+from tmc.record.run_folder import RunFolder
 from tmc.record.schemas import message_class
 from tmc.record.writer import LogWriter
 
@@ -26,10 +27,10 @@ _SCHEMA = {c.topic: c.schema for c in CHANNELS}
 
 
 class Journal:
-    """The file `tmc.mcap` of a run: config and map as attachments, then one message an entry.
+    """Write the file `tmc.mcap` of a run: config and map as attachments, then one message per entry.
 
-    `resume`: go on with the journal that an earlier incarnation of the TMC left in the folder, if it left one
-    (`found`). `timer`: a clock in s that is never set.
+    `resume`: continue the journal that an earlier incarnation of the TMC left in the folder; `found` says whether it
+    left one. `timer`: a monotonic clock (s).
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class Journal:
         self.world, self.folder = world, folder
         self._timer, self._started = timer, timer()
         self.found = resume and journal_in(folder) is not None
-        self.writer = LogWriter(folder / "tmc.mcap", "tmc", world.config.journal, {"run": run}, resume=resume)
+        self.writer = LogWriter(RunFolder(folder).journal, "tmc", world.config.journal, {"run": run}, resume=resume)
         self._policies: set[int] = set()
         self._stale = {*policies_in(folder)} if self.found else set[int]()
         self._since: float | None = None
@@ -72,33 +73,33 @@ class Journal:
 
     @property
     def due(self) -> float | None:
-        """Seconds until the entries that are not committed must be; None when all are."""
+        """Return the time until the next commit is due (s); None when everything is committed."""
         if self._since is None:
             return None
         return max(0.0, self._since + self.world.config.journal.commit_interval - time.monotonic())
 
     def commit(self) -> None:
-        """Hand over all entries so far: to the system, or to the disk."""
+        """Hand all entries over to the system, or to the disk, as `journal.durability` says."""
         self.writer.flush(fsync=self.world.config.journal.durability == "power")
         self._since = None
         self._append_ack()
 
     def _append_ack(self) -> None:
-        """In a trial with power cuts: how much of which file the disk has, for whoever simulates them."""
+        """Log, in a trial with power cuts, how much of which file the disk has: the trial cuts the file there."""
         config = self.world.config
         if config.trial.ack_log and config.journal.durability == "power":
-            path = self.folder / "acks" / "tmc.txt"
+            path = RunFolder(self.folder).acks_of("tmc")
             path.parent.mkdir(exist_ok=True)
             now = self.writer.active.stat()
             with path.open("a", encoding="utf-8") as file:
                 file.write(f"{now.st_ino} {now.st_size}\n")
 
     def keep_policies(self, held: Mapping[int, bytes]) -> None:
-        """Make the folder `policies` hold these policies, and none of those that it held before."""
+        """Make the folder `policies` hold these policies, and remove the others that it held."""
         for version in held.keys() - self._policies:
             path = policy_path(self.folder, version)
             path.parent.mkdir(parents=True, exist_ok=True)
-            put(path, held[version], sync=self.world.config.journal.durability == "power")
+            write_atomically(path, held[version], sync=self.world.config.journal.durability == "power")
         for version in (self._policies | self._stale) - held.keys():
             policy_path(self.folder, version).unlink(missing_ok=True)
         self._policies, self._stale = set(held), set()
@@ -116,24 +117,22 @@ class Journal:
 
 
 def journal_in(folder: Path) -> Path | None:
-    """The journal in a run folder, finished or left behind; None when there is none, or an empty file."""
-    paths = (folder / f"tmc.mcap{ACTIVE}", folder / "tmc.mcap")
-    return next((path for path in paths if path.is_file() and path.stat().st_size), None)
+    """Return the journal in a run folder, finished or left behind; None if there is none, or it is empty."""
+    return RunFolder(folder).existing_journal()
 
 
 def policy_path(folder: Path, version: int) -> Path:
-    """Where the TMC keeps the policy with this version while a UAV may ask for it."""
-    return folder / "policies" / f"policy-{version}.onnx"
+    """Return where the TMC keeps the policy with this version while a UAV may ask for it."""
+    return RunFolder(folder).policy(version)
 
 
 def policies_in(folder: Path) -> list[int]:
-    """The versions of the policy files in a run folder."""
-    names = (path.stem.removeprefix("policy-") for path in (folder / "policies").glob("policy-*.onnx"))
-    return [int(name) for name in names if name.isdecimal()]
+    """Return the versions of the policy files in a run folder."""
+    return RunFolder(folder).policy_versions()
 
 
 def roads_geojson(world: World) -> str:
-    """The streets as a GeoJSON FeatureCollection, longitude first."""
+    """Return the streets as a GeoJSON FeatureCollection, longitude first."""
     features = [
         {
             "type": "Feature",

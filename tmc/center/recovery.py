@@ -1,8 +1,8 @@
 """Recovery by replay: the journal, played through the station, gives the state of the TMC that wrote it.
 
-Only what came from outside is taken from the journal: flight records, policies, who was lost, when episodes began and
-how far the learner was. Everything else follows, and what a kill kept from being written is written then. Of episodes
-so old that the replay memory holds nothing of them, only the sums are taken.
+Only what came from outside is read from the journal: flight records, policies, which UAVs were lost, when episodes
+began, and how far the learner was. Everything else follows from these. Entries that a kill kept from being written are
+written then. Of episodes so old that the replay memory holds nothing of them, only the sums are read.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tmc.kernel import files
 from tmc.kernel.config import Config
 from tmc.record.builders import to_record
 from tmc.record.errors import RecordError
-from tmc.record.mcap.parser import Raw
+from tmc.record.mcap.parser import Message as LoggedMessage
 from tmc.record.reader import Log, decode
 
 Taker = Callable[[Station, Any, Path, float], None]
@@ -31,16 +31,16 @@ EPISODE, POLICY = "overfly.Episode", "overfly.Policy"
 
 
 def recover(station: Station, path: Path, now: float) -> list[JournalEntry]:
-    """Bring a new station to the state that the journal at `path` tells of; returns what is missing in the journal.
+    """Bring a new station to the state that the journal at `path` records; return the entries missing in the journal.
 
-    RecordError when the journal contradicts itself.
+    Raises RecordError if the journal contradicts itself.
     """
     log = Log(path)
     missing = play(station, log.raw(), path.parent, now, skipped(log, station.config))
     for i, member in enumerate(station.roster):
         member.heard = now
         if station.episode is not None and member.incarnation < 0 and i not in station.episode.lost:
-            member.incarnation = 0  # it has flown nothing yet, so its process is not known: it may be silent for ever
+            member.incarnation = 0  # its process is not known, since it has flown nothing yet: it may stay silent
     station.sample_queue.recovered = True
     station.committed()
     station.out.take()
@@ -49,15 +49,15 @@ def recover(station: Station, path: Path, now: float) -> list[JournalEntry]:
 
 def play(
     station: Station,
-    journal: Iterable[Raw],
+    journal: Iterable[LoggedMessage],
     folder: Path,
     now: float,
     skip: range = range(0),
     watch: Callable[[list[JournalEntry]], None] = lambda _: None,
 ) -> list[JournalEntry]:
-    """Play the messages of a journal; returns the entries that follow from them and are not among them.
+    """Play the messages of a journal; return the entries that follow from them and are not among them.
 
-    `folder` holds the policy files; of the episodes in `skip` only the sums are taken; `watch` is given all entries.
+    `folder` holds the policy files. Of the episodes in `skip` only the sums are read. `watch` gets all entries.
     """
     balance, skipping = _Balance(), False
 
@@ -66,7 +66,7 @@ def play(
         watch(made)
         balance.made(made)
 
-    keep()  # a fixed policy is taken before anything is heard
+    keep()  # a fixed policy is journalled before any message
     station.playing = True
     try:
         for raw in journal:
@@ -90,11 +90,11 @@ def _take(takers: dict[str, Taker], station: Station, message: Any, folder: Path
         if taker is not None:
             taker(station, message, folder, now)
     except RefusedError as refused:
-        raise RecordError(f"the journal contradicts itself, so do not go on with it: {refused}") from None
+        raise RecordError(f"the journal contradicts itself, so do not resume from it: {refused}") from None
 
 
 class _Balance:
-    """What the station makes against what is written, by topic: both come in the same order."""
+    """Compare, per topic, what the station makes with what is written; both come in the same order."""
 
     def __init__(self) -> None:
         self._written: Counter[str] = Counter()
@@ -116,16 +116,16 @@ class _Balance:
                 self._made.setdefault(entry.topic, deque()).append((self._count, entry))
 
     def missing(self) -> list[JournalEntry]:
-        """What was made and is not written, in its order."""
+        """Return what was made and is not written, in its order."""
         left = sorted((item for made in self._made.values() for item in made), key=lambda item: item[0])
         return [entry for _, entry in left]
 
 
-# Episodes that need not be flown again.
+# Episodes of which only the sums are read.
 
 
 def skipped(log: Log, config: Config) -> range:
-    """The episodes of which nothing is left: neither transitions in the replay memory, nor the start of learning."""
+    """Return the episodes of which nothing is needed: neither transitions of the replay, nor the start of learning."""
     ended, lost = 0, set[int]()
     for entry in log.entries(("/tmc/episode", "/tmc/lost")):
         if entry.topic == "/tmc/lost":
@@ -162,19 +162,19 @@ def _sum_sync(station: Station, message: Any, _folder: Path, _now: float) -> Non
     station.version = message.version
 
 
-# Episodes that are flown again.
+# Episodes that are played in full.
 
 
 def _in_turn(station: Station, message: Any) -> None:
     if station.episode is not None or station.episodes != message.episode - 1:
-        raise RecordError(f"the journal has episode {message.episode} out of turn: do not go on with it")
+        raise RecordError(f"the journal has episode {message.episode} out of turn: do not resume from it")
 
 
 def _next_of(station: Station, message: Any, now: float) -> Member:
-    """The UAV whose next record this is, and its process."""
+    """Return the member whose next record this is, after noting its process. Raises RecordError if it is not next."""
     team = station.roster
     if message.uav >= len(team) or message.sequence != team[message.uav].sequence:
-        text = f"the journal has record {message.sequence} of UAV {message.uav} out of turn: do not go on with it"
+        text = f"the journal has record {message.sequence} of UAV {message.uav} out of turn: do not resume from it"
         raise RecordError(text)
     member: Member = team[message.uav]
     member.heard_from(message.incarnation, now)
@@ -194,7 +194,7 @@ def _record(station: Station, message: Any, _folder: Path, now: float) -> None:
     record, episode = to_record(message), station.episode
     _next_of(station, message, now)
     if episode is None or record.episode != episode.number:
-        raise RecordError(f"the journal has a record of episode {record.episode} out of turn: do not go on with it")
+        raise RecordError(f"the journal has a record of episode {record.episode} out of turn: do not resume from it")
     station.accept(episode, record)
 
 
@@ -210,7 +210,7 @@ def _policy(station: Station, message: Any, folder: Path, _now: float) -> None:
 
 
 def _model(message: Any, folder: Path) -> bytes:
-    """The policy file, if it is still there and whole."""
+    """Return the policy file; empty if it is gone or damaged."""
     try:
         model = bytes(message.model) or files.read_bytes(policy_path(folder, message.version))
     except OSError:
@@ -219,7 +219,7 @@ def _model(message: Any, folder: Path) -> bytes:
 
 
 def _metrics(station: Station, message: Any, _folder: Path, _now: float) -> None:
-    station.finalise()  # here the TMC did; in between it may have taken any number of records
+    station.finalise()  # the TMC did so here; in between it may have accepted any number of records
     station.rate_limiter.updates = message.updates
 
 

@@ -1,8 +1,8 @@
 """The replay memory D: flight records in flat rings, and observations rebuilt from them on sampling (ADR 0002).
 
-A row is one tick of the whole team: where each UAV stood, the action and reward that brought it there, and which map
-frame it last got from the TMC. What UAV i believed at tick t follows: the frame, then the local updates of the ticks
-since (Sec. II-D). So a transition costs some 24 bytes and its share of a frame, not two images.
+A row is one tick of the whole team: where each UAV stood, the action and reward that led there, and which map frame it
+last got from the TMC. What UAV i believed at tick t follows: the frame, then the local updates of the ticks since
+(Sec. II-D). A transition therefore takes some 24 bytes and its share of a frame, not two images.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tmc.kernel.world import World
 
 @dataclass(frozen=True)
 class Sample:
-    """A minibatch: see `tmc.wire.messages.Minibatch` for the shapes. `row`, `uav`: where each transition stands."""
+    """Hold a minibatch; shapes as in `tmc.wire.messages.Minibatch`. `row`, `uav`: the place of each transition."""
 
     row: Ints
     uav: Ints
@@ -38,7 +38,7 @@ class Sample:
 
 
 class Ring:
-    """A flat array addressed by ever-growing numbers, of which the newest `length` are kept."""
+    """Keep the newest `length` items, addressed by numbers that only grow."""
 
     def __init__(self, length: int, width: int, dtype: str) -> None:
         self.data = np.zeros((length, width) if width else length, dtype)
@@ -50,12 +50,12 @@ class Ring:
         return np.asarray(self.data[number % len(self.data)])
 
     def of(self, number: Ints, column: Ints) -> NDArray[Any]:
-        """One entry of each of these rows. Shapes (B,)."""
+        """Return one entry per row. Shapes (B,)."""
         return np.asarray(self.data[number % len(self.data), column])
 
 
 class Replay:
-    """Holds the newest `replay.capacity` transitions of a mission; pure: rows in, minibatches out."""
+    """Hold the newest `replay.capacity` transitions of a mission; pure: rows in, minibatches out."""
 
     def __init__(self, world: World, observer: ObservationBuilder) -> None:
         config = world.config
@@ -79,26 +79,26 @@ class Replay:
         self._factors: dict[int, NDArray[np.float64]] = {}
         self._nowhere = np.uint16(world.grid.size)
         self._column = np.append(np.where(world.law.index < 0, R, world.law.index), R).astype(np.int64)
-        """Where cell k stands among the monitored ones, R where it does not. Shape (K + 1,)."""
+        """The place of cell k among the monitored cells, R if it is not one of them. Shape (K + 1,)."""
         self.priorities: Priorities | None = None
-        """By the number of a transition, place * N + UAV; None where all are equally likely."""
+        """By transition number, place * N + UAV; None if all are equally likely."""
         if config.replay.priority_exponent:
             self.priorities = Priorities(self._starts_kept * team, config.replay.priority_exponent)
 
     def __len__(self) -> int:
-        """Transitions that can be drawn."""
+        """Return how many transitions can be drawn."""
         return (self.starts_in - self._oldest) * self.world.config.team.size
 
     @property
     def _oldest(self) -> int:
-        """The oldest start of transitions that can be drawn."""
+        """Return the oldest start of transitions that can be drawn."""
         return max(self.starts_in - self._starts_kept, self._whole_from)
 
     def _let_go(self) -> None:
-        """Give up transitions of which rows or maps are written over.
+        """Give up transitions of which rows or maps are overwritten.
 
-        While everybody flies there are none: each row but an episode's last is a start, and the rings are as long as
-        that takes. Around the loss of a UAV rows come that are part of no transition, and more maps.
+        While all UAVs fly there are none: each row but an episode's last is a start, and the rings have room for these.
+        Around the loss of a UAV there are rows that are part of no transition, and more maps.
         """
         row, frame = self.rows_in - len(self.tick.data), self.frames_in - len(self.frame_tick.data)
         if row <= 0 and frame <= 0:
@@ -112,14 +112,14 @@ class Replay:
             self.priorities.drop(np.arange(first * team, place * team))
 
     def _is_whole(self, start: int, row: int, frame: int) -> bool:
-        """Whether all that the transitions from row `start` are made of is there: what is from `row` and `frame` on."""
+        """Return True if the rows (from `row` on) and maps (from `frame` on) of the transitions at `start` are held."""
         at = np.array(start)
         maps = self.base[at][self._present(at)]
         # The local updates begin at the exchange before, at most T_u rows back.
         return start - self.world.config.T_u >= row and int(maps.min(initial=self.frames_in)) >= frame
 
     def add_frame(self, tick: int, frame: NDArray[np.generic]) -> int:
-        """Keep a map as a UAV got it at `tick`: last visits (R,) u16, or e_k (R,) bool in scenario I. Its number."""
+        """Keep a map as a UAV got it at `tick`, (R,) u16 last visits or bool e_k in scenario I; return its number."""
         self.frames[self.frames_in] = np.packbits(frame.astype(bool)) if self._events else frame
         self.frame_tick[self.frames_in] = tick
         self.frames_in += 1
@@ -136,9 +136,9 @@ class Replay:
         base: Ints,
         sure: Sequence[bool],
     ) -> None:
-        """Ticks of `episode` from `first` on, all in order from 0. Shapes (n, N): what led to a tick stands with it.
+        """Add ticks of `episode` from `first` on, in order from 0. Shapes (n, N): what led to a tick is in its row.
 
-        A cell off the grid stands for a UAV that was lost. A row that is not `sure` is part of no transition.
+        A cell off the grid means that the UAV was lost. A row that is not `sure` is part of no transition.
         """
         row = self.rows_in
         rows = np.arange(row, row + len(cells))
@@ -151,7 +151,7 @@ class Replay:
         self._let_go()
 
     def _add_starts(self, row: int, first: int, sure: Sequence[bool]) -> None:
-        """The transitions that end in the rows from `row` on, the first of which is of tick `first`."""
+        """Add the transitions that end in the rows from `row` on; the first of these is of tick `first`."""
         starts, ends = [], []
         for number, known in enumerate(sure):
             end, tick = row + number, first + number
@@ -168,7 +168,7 @@ class Replay:
             self.priorities.add(self._present(np.array(ends, np.int64)).ravel())
 
     def set_initial_errors(self, row: int, errors: NDArray[np.float64]) -> None:
-        """|TD error|, shape (n, N), of the transitions that start in the rows from `row` on; NaN where not known."""
+        """Set |TD error|, (n, N), of the transitions that start in the rows from `row` on; NaN: not known."""
         assert self.priorities is not None
         newest = min(self.starts_in, self._starts_kept, self.rows_in - row)  # every row has one start at most
         place = np.arange(self.starts_in - newest, self.starts_in)
@@ -180,7 +180,7 @@ class Replay:
         self.priorities.set(numbers[known], found[known])
 
     def _present(self, row: Ints) -> NDArray[np.bool_]:
-        """Shape (B, N): False for those who were lost by then."""
+        """Return (B, N) bool: False for UAVs that were lost by then."""
         return np.asarray(self.cells[row] < self.world.grid.size)
 
     def _remember(self, episode: int) -> None:
@@ -193,7 +193,7 @@ class Replay:
             del self._factors[gone]
 
     def digest(self) -> str:
-        """BLAKE2b, hex, of every transition that can be drawn and of the maps behind them, whatever their numbers."""
+        """Return the BLAKE2b digest (hex) of all drawable transitions and their maps, independent of their numbers."""
         place = np.arange(self._oldest, self.starts_in)
         held = place.size
         start, end = self.starts[place], self.ends[place]
@@ -207,7 +207,7 @@ class Replay:
         return hashlib.blake2b(b"".join(p.tobytes() for p in parts), digest_size=16).hexdigest()
 
     def sample(self, number: int, batch: int) -> Sample:
-        """Minibatch `number` (which addresses the draws): uniform over all transitions held, or by their priorities."""
+        """Draw minibatch `number`, which addresses the draws: uniform over all transitions, or by their priorities."""
         u = uniforms(self.world.config.training.seed, Stream.REPLAY, 2 * batch, tick=number)
         if self.priorities is not None and self.priorities.total > 0.0:
             index = self.priorities.draw(u[:batch])
@@ -219,12 +219,12 @@ class Replay:
         present = self._present(end)
         uav = (u[batch:] * present.sum(axis=1)).astype(np.int64)
         if not present.all():
-            order = np.argsort(~present, axis=1, kind="stable")  # those who were not lost come first
+            order = np.argsort(~present, axis=1, kind="stable")  # UAVs that were not lost come first
             uav = order[np.arange(batch), uav]
         return self.rebuild(place, uav, np.zeros(0, np.float32))
 
     def rebuild(self, place: Ints, uav: Ints, weight: Floats) -> Sample:
-        """Transitions of UAVs `uav` at these places among the starts. Shapes (B,); `weight` may be empty."""
+        """Rebuild the transitions of UAVs `uav` at these starts. Shapes (B,); `weight` may be empty."""
         B, start, end = place.size, self.starts[place].astype(np.int64), self.ends[place].astype(np.int64)
         views = self.views(np.concatenate([start, end]), np.concatenate([uav, uav]))
         action = self.actions.of(start + 1, uav)
@@ -241,22 +241,22 @@ class Replay:
         )  # fmt: skip
 
     def views(self, row: Ints, uav: Ints) -> Views:
-        """What o_i at these rows is made of, exactly as the UAVs saw it. Shapes (B,)."""
+        """Return what o_i at these rows is drawn from, exactly as the UAVs saw it. Shapes (B,)."""
         team = self._team(row)
         return self.observer.views(team[np.arange(row.size), uav], team, uav, self.belief(row, uav))
 
     def allowed(self, views: Views) -> NDArray[np.uint8]:
-        """The actions that UAVs who see this would allow. Shape (B, 9)."""
+        """Return the actions that a UAV with these views would allow. Shape (B, 9)."""
         if not self.world.config.exploration.mask_blocked:
             return np.ones((views.cells.size, N_ACTIONS), np.uint8)
         return self.observer.allowed_batch(views)
 
     def _team(self, row: Ints) -> Ints:
-        """Cells of the team at these rows, (B, N); K for a UAV that was lost."""
+        """Return the cells of the team at these rows, (B, N); K for a UAV that was lost."""
         return np.asarray(np.minimum(self.cells[row], self._nowhere), np.int64)
 
     def belief(self, row: Ints, uav: Ints) -> Floats:
-        """U_i over the monitored cells, shape (B, R), as the observation has it."""
+        """Return U_i over the monitored cells, (B, R), as the observation has it."""
         base = self.base.of(row, uav)
         frame = self.frames[base]
         if self._events:
@@ -269,7 +269,7 @@ class Replay:
         return self.world.law.singles(last_visit, self.tick[row].astype(np.int64)[:, None], s)
 
     def _local_updates(self, row: Ints, uav: Ints, last_visit: NDArray[np.uint16], since: Ints) -> NDArray[np.uint16]:
-        """The local update (Sec. II-D), in place, of every tick after `since`: own cell, and those of sensed peers."""
+        """Apply in place the local updates (Sec. II-D) of every tick after `since`: own and sensed cells."""
         tick, R = self.tick[row].astype(np.int64), last_visit.shape[1]
         batch, back = _ages(tick - since)
         team, own = self._team(row[batch] - back), uav[batch]
@@ -285,7 +285,7 @@ class Replay:
 
 
 def _ages(ticks: Ints) -> tuple[Ints, Ints]:
-    """For each row b, the ages ticks[b] - 1, ..., 1, 0: pairs (b, age), flat. Negative counts have none."""
+    """Return flat pairs (b, age) with ages ticks[b] - 1, ..., 1, 0 for each row b; none for negative counts."""
     count = np.maximum(ticks, 0)
     batch = np.repeat(np.arange(ticks.size), count)
     return batch, np.repeat(np.cumsum(count), count) - 1 - np.arange(batch.size)

@@ -1,4 +1,4 @@
-"""PolicySpec takes part in a mission, as the TMC knows them, and what the TMC has for them."""
+"""The roster: the clients that take part in a mission as the TMC knows them, and the outbox for them."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ LEARNER = "learner"
 
 
 def uav_name(i: int) -> str:
-    """The address of UAV i's process."""
+    """Return the address of UAV i's process."""
     return f"uav-{i:03d}"
 
 
 @dataclass
 class Outbox:
-    """What the core wants done: messages to send, entries to journal, notes for the log. The service empties it."""
+    """Hold what the core wants done: messages to send, entries to journal, notes to log. The service empties it."""
 
     sends: list[tuple[str, m.Message]] = field(default_factory=list)
     entries: list[entries.JournalEntry] = field(default_factory=list)
     notes: list[tuple[str, str]] = field(default_factory=list)
 
     def take_sends(self) -> list[tuple[str, m.Message]]:
-        """The messages alone."""
+        """Remove and return the messages."""
         taken, self.sends = self.sends, []
         return taken
 
     def take_entries(self) -> Outbox:
-        """The entries and notes alone."""
+        """Remove and return the entries and notes."""
         taken = Outbox([], self.entries, self.notes)
         self.entries, self.notes = [], []
         return taken
 
     def take(self) -> Outbox:
-        """All of it; this outbox is empty afterwards."""
+        """Remove and return everything."""
         taken = Outbox(self.sends, self.entries, self.notes)
         self.sends, self.entries, self.notes = [], [], []
         return taken
@@ -43,11 +43,12 @@ class Outbox:
 
 @dataclass
 class Member:
-    """A UAV on the roster: its process's incarnation, the incarnations before it, when it was last heard of, its last
-    answer.
+    """Hold what the TMC knows of one UAV's process.
 
-    `sequence`: of its next record; `durable`: its records below this number are in the journal for good; `policy`: the
-    version that it was told to fly. Its next process flies that too: peers may have seen what the last one flew.
+    `incarnation`: of the process, -1 if there is none; `former`: the incarnations before it; `heard`: when it was last
+    heard (s); `sequence`: the number of its next record; `durable`: its records below this number are committed;
+    `policy`: the version that it was told to fly. A new process flies that version too, since peers may have seen where
+    the last one flew. `answer`: the last Map sent to it; `named`: True once its present silence was logged.
     """
 
     incarnation: int = -1
@@ -60,7 +61,7 @@ class Member:
     named: bool = False
 
     def heard_from(self, incarnation: int, now: float) -> bool:
-        """Heard at `now` of the process `incarnation`; True when it takes the place of another one."""
+        """Note that a process was heard at `now` (s); return True if it replaces another one."""
         new = self.incarnation not in {-1, incarnation}
         if new:
             self.former.add(self.incarnation)
@@ -69,17 +70,17 @@ class Member:
 
 
 def away(members: list[Member]) -> list[int]:
-    """UAVs without a process."""
+    """Return the UAVs without a process."""
     return [i for i, member in enumerate(members) if member.incarnation < 0]
 
 
 def name_some(names: list[str]) -> str:
-    """The first ten names, and how many more there are."""
+    """Return the first ten names, and how many more there are, as text."""
     return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
 
 
 def silent(members: list[Member], now: float, patience: float) -> list[int]:
-    """UAVs with a process that was not heard of for `patience` seconds, each named once in its silence."""
+    """Return the UAVs that have not been heard for `patience` seconds, each once per silence."""
     found = [i for i in long_silent(members, now, patience) if not members[i].named]
     for i in found:
         members[i].named = True
@@ -87,12 +88,12 @@ def silent(members: list[Member], now: float, patience: float) -> list[int]:
 
 
 def long_silent(members: list[Member], now: float, patience: float) -> list[int]:
-    """UAVs with a process that was not heard of for `patience` seconds."""
+    """Return the UAVs with a process that has not been heard for `patience` seconds."""
     return [i for i, m in enumerate(members) if m.incarnation >= 0 and now - m.heard > patience]
 
 
 def excuse(members: list[Member], pause: float, now: float) -> None:
-    """Nobody could be heard for `pause` seconds before `now`: they are no silence of anybody's."""
+    """Do not count the `pause` seconds before `now` as silence: no client could be heard then."""
     for member in members:
         member.heard = min(member.heard + pause, now)
 
@@ -102,16 +103,16 @@ Problem = tuple[str, str] | None
 
 
 def hello_problem(members: list[Member], sender: str, hello: m.Hello) -> Problem:
-    """Why a UAV cannot say hello: another name than its own, or an incarnation that a newer one took the place of."""
+    """Return why a UAV cannot say hello: the name is not its own, or a newer incarnation has replaced it."""
     if not 0 <= hello.uav < len(members) or sender != uav_name(hello.uav):
-        return "refused", f"{sender} is no name for UAV {hello.uav} of a team of {len(members)}"
+        return "refused", f"{sender} is not the name of UAV {hello.uav} in a team of {len(members)}"
     if hello.incarnation in members[hello.uav].former:
         return "fenced", f"a newer process flies {sender}: leave"
     return None
 
 
 def record_problem(members: list[Member], sender: str, record: m.Record) -> Problem:
-    """Why a UAV cannot ship a record: not its own, not known here, or of an older incarnation."""
+    """Return why a UAV cannot ship a record: it is not its own, not known here, or of an older incarnation."""
     if not 0 <= record.uav < len(members) or sender != uav_name(record.uav):
         return "refused", f"{sender} cannot ship a record of UAV {record.uav}"
     if members[record.uav].incarnation < 0:

@@ -11,41 +11,29 @@ from typing import Any
 import zmq
 
 from tmc.center import roster
+from tmc.center.commit_gate import CommitGate
 from tmc.center.journal import Journal
 from tmc.center.roster import LEARNER, uav_name
 from tmc.center.station import Station
 from tmc.wire import process, sockets
 from tmc.wire.codec import CodecError, decode
-from tmc.wire.messages import Begin, Bye, End, Lost, Map, Message, PolicyPush, Welcome
+from tmc.wire.messages import Bye, End, PolicyPush, Welcome
 
 MESSAGES_PER_POLL = 64
 """Messages taken from one socket before the other has its turn."""
 BATCH_DELAY_S = 0.01
-"""Seconds that book-keeping waits for more of its kind: a dozen records in a row cost a third of one at a time, since
-the processor has the code at hand."""
+"""Time that book-keeping waits for more of its kind: a dozen records in a row cost a third of one at a time, since the
+processor's caches hold the code."""
 STALL_THRESHOLD_S = 1.0
-"""Seconds from one turn of the loop to the next from which on nobody is blamed for them."""
+"""A loop iteration longer than this does not count as client silence."""
 SHUTDOWN_TIMEOUT_S = 60.0
-"""Seconds that the TMC waits for the last client to leave once the mission is over."""
+"""Time that the TMC waits for the last client to leave once the mission is over."""
 RECONNECT_WINDOW_S = 3.0
-"""Seconds that a TMC that was started again waits to hear of clients that do not know yet that the mission is over."""
-
-MAX_TICKS_UNCOMMITTED = 100
-"""Ticks by which answers are ahead of the journal at most, in a training. So a TMC that was started again knows up to
-which tick its last incarnation may have answered: up to there it names the policy that that one named."""
-
-
-def binds(message: Message) -> bool:
-    """Whether the UAVs that are told this act on it for good, so that no TMC may come back without it.
-
-    With a new episode they forget where they were in the last one, which a new process that had to fly the last one's
-    end would ask them; and those who are told of a loss no longer look out for who is lost.
-    """
-    return isinstance(message, Lost) or (isinstance(message, Begin) and message.shipped < 0)
+"""Time that a restarted TMC waits for clients that may not know yet that the mission is over."""
 
 
 class Service:
-    """Binds both sockets, and serves until the mission is over or `stop` says so."""
+    """Bind both sockets, and serve until the mission is over or `stop` returns True."""
 
     def __init__(self, station: Station, journal: Journal, endpoint: str) -> None:
         self.station, self.journal, self.endpoint = station, journal, endpoint
@@ -59,20 +47,15 @@ class Service:
             self._expected = {*map(uav_name, range(len(station.roster))), *([LEARNER] if station.learning else [])}
         self._over: float | None = None
         self._taken: Counter[str] = Counter()
-        self._flies: dict[str, int] = {}
-        """The policy that each UAV was last told to fly; all of that is committed."""
-        self._answered = self._committed = 0
-        """Up to when UAVs were answered, and up to when that is committed; see `_when`."""
-        self._free = self._reached() + MAX_TICKS_UNCOMMITTED if journal.found else 0
-        """Up to when UAVs must have been answered before a newer policy is taken."""
+        self._gate = CommitGate(station, resumed=journal.found)
         self._waiting: PolicyPush | None = None
         self._ticked = time.monotonic()
         self._reminder = process.Reminder()
         self._unjournalled_since: float | None = None
-        """When the oldest entry came that is not journalled, seconds of the monotonic clock."""
+        """When the oldest entry came that is not journalled (s, monotonic clock)."""
 
     def serve(self, stop: Callable[[], bool]) -> bool:
-        """The main loop. True when the mission came to its end, False when it was stopped."""
+        """Run the main loop; return True when the mission came to its end, False when it was stopped."""
         poller = zmq.Poller()
         for sock in (self.sync, self.learner_socket):
             poller.register(sock, zmq.POLLIN)
@@ -93,7 +76,7 @@ class Service:
         return False
 
     def _tick(self) -> None:
-        """Count the UAVs' silence, without the time in which this process was stopped, or waited for a slow disk."""
+        """Count the UAVs' silence, without the time for which this process was stopped or waited for a slow disk."""
         now, then = time.monotonic(), self._ticked
         if now - then > STALL_THRESHOLD_S:
             roster.excuse(self.station.roster, now - then, now)
@@ -101,11 +84,10 @@ class Service:
         self.station.tick(now)
 
     def _remind(self) -> None:
-        """Say for what the mission waits, where it has not gone on for some seconds."""
+        """Print what the mission waits for, if it has made no progress for some seconds."""
         station = self.station
-        if self._reminder.due((station.phase, station.ticks, station.rate_limiter.updates)) and (
-            text := self._waits_for()
-        ):
+        progress = (station.phase, station.ticks, station.rate_limiter.updates)
+        if self._reminder.due(progress) and (text := self._waits_for()):
             process.note(text)
 
     def _waits_for(self) -> str:
@@ -115,17 +97,17 @@ class Service:
         return f"the TMC waits for {missing}" if missing else ""
 
     def _patience(self) -> int:
-        """Milliseconds to wait for a message; not so long that a silence would be seen late."""
-        due = (
-            self.journal.due
-            if self._unjournalled_since is None
-            else self._unjournalled_since + BATCH_DELAY_S - time.monotonic()
-        )
+        """Return the time to wait for a message (ms), short enough that a silence is not noticed late."""
+        due = self.journal.due
+        if self._unjournalled_since is not None:
+            due = self._unjournalled_since + BATCH_DELAY_S - time.monotonic()
         return 100 if due is None else min(100, max(0, math.ceil(1000 * due)))
 
     def _finalise(self) -> None:
-        """The book-keeping that nobody waits for, and a group commit where one is due; only then are records
-        acknowledged, with the answers to later ones."""
+        """Do the book-keeping that no client waits for, and a group commit if one is due.
+
+        Only then are records acknowledged, with the answers to later ones.
+        """
         station, since, due = self.station, self._unjournalled_since, self._commit_due()
         if since is not None and (due or station.finalise_now or time.monotonic() - since >= BATCH_DELAY_S):
             self._unjournalled_since = None
@@ -138,16 +120,16 @@ class Service:
             self._send()
 
     def _write(self) -> None:
-        """Hand over to the journal whatever was accepted."""
+        """Hand over to the journal everything that was accepted."""
         if self.station.learning:
             self.journal.keep_policies(self.station.policies.held())
         self.journal.take(self.station.out.take_entries())
 
     def _commit(self) -> None:
-        """Commit the journal, in which is whatever was accepted: so all of it is acknowledged."""
+        """Commit the journal, which holds everything that was accepted, and so acknowledge all of it."""
         self.journal.commit()
         self.station.committed()
-        self._committed = self._answered
+        self._gate.committed()
 
     def _commit_due(self) -> bool:
         due = self.journal.due
@@ -160,7 +142,7 @@ class Service:
                 return
             self._take(sock, bytes(frames[0]), frames[1:])
             if self.station.config.trial.ack_early:
-                self.station.committed()  # which it is not: a trial must see what comes of that
+                self.station.committed()  # it is not: a trial must see what follows from that
             self._send()
 
     def _take(self, sock: zmq.Socket[Any], identity: bytes, frames: list[Any]) -> None:
@@ -176,84 +158,44 @@ class Service:
         self._taken[type(message).__name__] += 1
         if isinstance(message, Bye):
             self._here.discard(sender)
-        if (
-            isinstance(message, PolicyPush)
-            and sender == LEARNER
-            and message.incarnation not in self.station.sample_queue.former
-        ):
-            self._waiting = message  # in the place of one that may wait
+        former = self.station.sample_queue.former
+        if isinstance(message, PolicyPush) and sender == LEARNER and message.incarnation not in former:
+            self._waiting = message  # replaces an older one that may wait
             self._take_waiting()
         else:
             self.station.answer(sender, message, time.monotonic())
 
     def _take_waiting(self) -> None:
         push = self._waiting
-        if push is not None and self._may_change:
+        if push is not None and self._gate.policy_may_change:
             self._waiting = None
             self.station.answer(LEARNER, push, time.monotonic())
 
-    @property
-    def _may_change(self) -> bool:
-        """False while exchanges may be repeated that an earlier incarnation has answered: the same policy must be named
-        then.
-
-        True whenever that policy is not at hand, or none will be named any more.
-        """
-        station = self.station
-        over = station.phase in {"learning", "done"}
-        return self._answered >= self._free or over or station.policies.find(station.policies.newest) is None
-
-    def _reached(self) -> int:
-        """When the next exchange is."""
-        episode = self.station.episode
-        if episode is None:
-            return self._when(self.station.episodes + 1, 0)
-        return self._when(episode.number, episode.next_exchange)
-
-    def _when(self, episode: int, tick: int) -> int:
-        """Ticks since the mission began, each episode's last one counted."""
-        return episode * (self.station.config.training.ticks + 1) + tick
-
     def _send(self) -> None:
-        """Send what the station has for others. The journal can wait, since only what is committed is acknowledged, and
-        `_secure` has seen to the policies."""
+        """Send what the station has for clients.
+
+        The journal may wait: only what is committed is acknowledged, and the commit gate knows the exceptions.
+        """
         out = self.station.out
         if self._unjournalled_since is None and (out.entries or out.notes):
             self._unjournalled_since = time.monotonic()
         sends = out.take_sends()
-        self._secure(sends)
+        if self._gate.must_commit(sends):
+            self._write()
+            self._commit()
         for name, message in sends:
-            # PolicySpec was not heard yet may have been connected to an earlier incarnation of this process.
-            sock, identity = self._where.get(name) or (
-                self.learner_socket if name == LEARNER else self.sync,
-                name.encode(),
-            )
+            # A client that was not heard yet may have been connected to an earlier incarnation of this process.
+            default = (self.learner_socket if name == LEARNER else self.sync, name.encode())
+            sock, identity = self._where.get(name, default)
             sockets.send(sock, message, identity)
-            if isinstance(message, Welcome):  # one that was refused is not waited for
+            if isinstance(message, Welcome):  # a client that was refused is not waited for
                 self._here.add(name)
                 self._expected.discard(name)
 
-    def _secure(self, sends: list[tuple[str, Message]]) -> None:
-        """Commit first what must not be lost once these are sent: see `binds`, and that a UAV was told to fly another
-        policy.
-
-        Should the TMC and that UAV be killed, the UAV's next process must be told the same, for peers may have seen
-        where the last one went.
-        """
-        answers = [(name, message) for name, message in sends if isinstance(message, Begin | Map)]
-        told = {name: answer.policy for name, answer in answers}
-        self._answered = max([self._answered, *(self._when(a.episode, a.tick) for _, a in answers)])
-        ahead = self.station.learning and self._answered > self._committed + MAX_TICKS_UNCOMMITTED
-        changes = any(self._flies.get(name, 0) != policy for name, policy in told.items())
-        if ahead or changes or any(binds(message) for _, message in sends):
-            self._write()
-            self._commit()
-        self._flies |= told
-
     def _finished(self) -> bool:
-        """Over, and everybody has left or was given time to."""
+        """Return True when the mission is over, and all clients have left or had time to."""
         if self.station.phase != "done":
-            self._over = None  # a learner from an older checkpoint makes up for what it lost
+            self._over = None  # a learner from an older checkpoint repeats the updates that it lost
             return False
         now = time.monotonic()
         self._over = self._over or now
@@ -261,10 +203,10 @@ class Service:
 
     def _say_goodbye(self, reason: str) -> None:
         for sock, identity in self._where.values():
-            sockets.send(sock, End(reason), identity)
+            sockets.send(sock, End(reason=reason), identity)
 
     def _sum_up(self) -> None:
-        """What the radio carried, as one line of the log."""
+        """Log how many messages of each type were received."""
         counts = " · ".join(f"{name} {count}" for name, count in sorted(self._taken.items()))
         self.journal.writer.log("info", f"messages taken: {counts}")
 

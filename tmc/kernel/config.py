@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.files import plain
 from tmc.kernel.text import nearest
 
@@ -23,7 +24,7 @@ TRIAL = "trial."
 """Prefix of the settings that only `overfly verify` changes: they stall UAVs, or lose data by design."""
 
 
-class ConfigError(ValueError):
+class ConfigError(OverflyError, ValueError):
     """A setting that cannot be: one sentence with the key and the fix."""
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tmc.kernel.grid import OFF_GRID, STAY
+from tmc.kernel.grid import ACTIONS, OFF_GRID, STAY
 from tmc.kernel.policy import view_shape
 from tmc.kernel.world import World
 
@@ -36,6 +36,21 @@ class Views:
     def rows(self, which: slice | NDArray[np.int64]) -> Views:
         """Some of them."""
         return Views(self.cells[which], self.peers[which], self.u[which])
+
+
+def allowed_in(observation: Floats) -> list[int]:
+    """Actions that nothing shown in an observation (3, H, W) blocks, as `ObservationBuilder.allowed` lists them.
+
+    Staying is always among them.
+    """
+    place, terrain = observation[0], observation[1]
+    height, width = place.shape
+    row, col = divmod(int((place == EGO).argmax()), width)
+
+    def is_free(r: int, c: int) -> bool:
+        return bool(0 <= r < height and 0 <= c < width and terrain[r, c] >= 0.0 and place[r, c] != PEER)
+
+    return [a for a, (_, dr, dc) in enumerate(ACTIONS) if a == STAY or is_free(row + dr, col + dc)]
 
 
 class ObservationBuilder:

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass, fields
 
 from tmc.kernel.config import Config, ConfigError, NetworkConfig, build
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.files import plain
 from tmc.kernel.grid import N_ACTIONS, Grid
 
@@ -17,7 +18,7 @@ INPUT, OUTPUT = "observation", "q"
 N_CHANNELS = 3
 
 
-class PolicyError(ValueError):
+class PolicyError(OverflyError, ValueError):
     """A policy that cannot fly here: one sentence with the fix."""
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.files import plain
 
 FREE, ROAD, BLOCKED = ".", "#", "X"
@@ -26,7 +27,7 @@ CELL_M = (0.01, 100_000.0)
 """Least and largest width of a cell, metres: none that is flown over lies outside."""
 
 
-class MapError(ValueError):
+class MapError(OverflyError, ValueError):
     """A road map that cannot be used: the message says what was wrong, where, and the fix, in one sentence."""
 
 

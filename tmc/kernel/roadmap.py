@@ -23,7 +23,7 @@ from tmc.kernel.rastertext import BLOCKED, CELL_M, FREE, ROAD, MapError, parse_t
 from tmc.kernel.text import nearest
 
 __all__ = [
-    "COPY",
+    "MAP_COPY",
     "OBSTACLES",
     "ROADS",
     "UNREACHABLE",
@@ -41,7 +41,7 @@ ROADS = ("major", "main", "arterial", "all")
 OBSTACLES = ("none", "static", "event-day")
 USUAL_CELL_M = 60.0
 """The width of a cell, metres, where a text raster names none: the built-in map's."""
-COPY = "map.txt"
+MAP_COPY = "map.txt"
 """The copy of a user's map in the run folder, so that the folder is enough to go on with the run, wherever it lies."""
 Scalar = TypeVar("Scalar", bound=np.generic)
 MAX_BYTES = 2**18  # 65,535 one-cell rows with CRLF need 196,605 bytes; the rest is room for a header
@@ -161,7 +161,7 @@ def load_map(name: str, roads: str = "main", obstacles: str = "static") -> RoadM
 
 def map_of_run(folder: Path, name: str, roads: str, obstacles: str) -> RoadMap:
     """As `load_map`, for a run in `folder`: its own copy of a user's map wins, whatever became of the file."""
-    copy = folder / COPY
+    copy = folder / MAP_COPY
     own = name not in builtin_maps() and copy.exists()
     return load_map(str(copy) if own else name, roads, obstacles)
 

@@ -1,4 +1,4 @@
-"""Messages of the log, made from what the services hold, and back again."""
+"""Build the messages of the log from what the services hold, and convert them back."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ _CODES = {"<u2": "H", "u1": "B", "<f4": "f"}
 
 
 def flight_record(record: Record) -> Any:
-    """The overfly.FlightRecord of a Record, all but `sent`; `to_record` gives back the very same."""
+    """Return the overfly.FlightRecord of a Record, without `sent`; `to_record` is the inverse."""
     numbers = {name: getattr(record, name) for name in _NUMBERS}
     return FlightRecord(**numbers, **{name: getattr(record, name).tolist() for name in _ARRAYS})
 
 
 def record_digest(record: Record) -> str:
-    """BLAKE2b, hex, of all that a flight record says of the flight, whichever incarnation of the UAV shipped it."""
+    """Return the BLAKE2b (hex, 128 bits) of a flight record without the incarnation of the UAV that sent it."""
     numbers = " ".join(str(getattr(record, name)) for name in _NUMBERS if name != "incarnation")
     arrays = (getattr(record, name).tobytes() for name in _ARRAYS)
     return hashlib.blake2b(b"".join((numbers.encode(), *arrays)), digest_size=16).hexdigest()
 
 
 def to_record(proto: Any) -> Record:
-    """The Record of an overfly.FlightRecord; RecordError when it holds values that no Record may have."""
+    """Return the Record of an overfly.FlightRecord; RecordError when a value is not valid in a Record."""
     values: dict[str, Any] = {name: getattr(proto, name) for name in _NUMBERS}
     try:
         values |= {name: _array(getattr(proto, name), kind) for name, kind in _ARRAYS.items()}
@@ -61,20 +61,24 @@ def to_record(proto: Any) -> Record:
 
 def _array(values: Any, kind: str) -> NDArray[Any]:
     try:
-        return np.array(array(_CODES[kind], values[:]), kind)  # checks the range, and is faster than NumPy's own way
+        return np.array(array(_CODES[kind], values[:]), kind)  # checks the range, and is faster than NumPy
     except OverflowError:
         raise FieldError("range", f"a value does not fit {kind}") from None
 
 
 def grid(last_visit: NDArray[np.integer], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
-    """A foxglove.Grid of the ticks of the last visits, shape (K,), uint32; see `layers`. `last_visit` undoes it."""
+    """Return a foxglove.Grid of the ticks of the last visits, shape (K,), uint32; `last_visit` is the inverse.
+
+    `cell_m`: size of a cell, metres. `time_ns`: its timestamp. RecordError as `layers`.
+    """
     return layers({"last_visit": last_visit.astype("<u4")}, rows, cols, cell_m, time_ns)
 
 
 def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
-    """A foxglove.Grid of cells of `cell_m` metres with these fields, each of shape (K,) and of a dtype of NUMERIC.
+    """Return a foxglove.Grid with these fields, each of shape (K,) and of a dtype of NUMERIC; `layer` is the inverse.
 
-    A Grid grows to the north, our rows to the south: so the rows are turned round. `layer` undoes it.
+    `cell_m`: size of a cell, metres. The rows are reversed: those of a Grid go north, ours go south. RecordError when
+    a field does not have rows * cols values.
     """
     for values in fields.values():
         if values.shape != (rows * cols,):
@@ -101,7 +105,7 @@ def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: flo
 
 
 def layer(message: Any, name: str) -> NDArray[Any]:
-    """Shape (K,): the field `name` as `layers` was given it; RecordError when the grid has no such field."""
+    """Return the field `name` of a Grid, shape (K,), as given to `layers`; RecordError when there is none."""
     names = [field.name for field in message.fields]
     if name not in names:
         raise RecordError(f"the grid has no field {name}: it has {', '.join(names)}")
@@ -113,24 +117,24 @@ def layer(message: Any, name: str) -> NDArray[Any]:
 
 
 def last_visit(message: Any) -> NDArray[np.uint32]:
-    """Shape (K,): the ticks that `grid` was given."""
+    """Return the ticks of the last visits, shape (K,), uint32, as given to `grid`."""
     return layer(message, "last_visit")
 
 
 def location_fix(lon: float, lat: float, time_ns: int, frame: str = FRAME, altitude: float = 0.0) -> Any:
-    """A foxglove.LocationFix: degrees (WGS 84), metres."""
+    """Return a foxglove.LocationFix: degrees (WGS 84), altitude in metres."""
     message = message_class("foxglove.LocationFix")(frame_id=frame, latitude=lat, longitude=lon, altitude=altitude)
     message.timestamp.FromNanoseconds(time_ns)
     return message
 
 
 def geojson(text: str) -> Any:
-    """A foxglove.GeoJSON of a GeoJSON document."""
+    """Return a foxglove.GeoJSON of a GeoJSON document."""
     return message_class("foxglove.GeoJSON")(geojson=text)
 
 
 def log_message(level: str, text: str, name: str, time_ns: int) -> Any:
-    """A foxglove.Log: `name` is the process that speaks; RecordError when the level is none of LEVELS."""
+    """Return a foxglove.Log; `name` is the process that writes it. RecordError when the level is not in LEVELS."""
     if level not in LEVELS:
         raise RecordError(f"there is no log level {level!r}: choose one of {', '.join(LEVELS)}")
     message = message_class("foxglove.Log")(level=LEVELS[level], message=printable(text), name=printable(name))

@@ -1,7 +1,7 @@
-"""Two logs of one mission, fact by fact: the first that is not the same in both, with its tick and its UAV.
+"""Compare the logs of two runs of one mission, and find the first fact that differs, with its tick and its UAV.
 
-What depends on the schedule is no fact: wall times, the incarnations of processes, and how many ticks one message
-holds.
+What depends on the timing of the processes is not compared: wall times, the incarnations of processes, and how many
+ticks one message holds.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ import numpy as np
 
 from tmc.record import builders
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import run_files
 
 TEAM = -1
-"""Stands for the UAV in facts of the whole team."""
+"""The UAV number in facts of the whole team."""
 KINDS: tuple[str, ...] = (
     "begin of the episode", "cell", "block", "own reward", "sightings", "record", "events", "uncertainty",
     "team's reward", "sync reply", "map handed out", "observation", "action", "end of the episode",
 )  # fmt: skip
-"""What is compared, in the order in which one follows from another within a tick."""
+"""What is compared, causes before effects within a tick."""
 _RANK = {kind: rank for rank, kind in enumerate(KINDS)}
 
 Key = tuple[int, int, int, int]
-"""(episode, tick, place in KINDS, UAV): sorted, the first difference is the cause of the others."""
+"""(episode, tick, index in KINDS, UAV). In this order, the first difference is the cause of the others."""
 Value = int | float | bytes | tuple[Any, ...]
 Keyed = Iterator[tuple[Key, Value]]
 Facts = Mapping[Key, Value]
@@ -36,7 +37,7 @@ Facts = Mapping[Key, Value]
 
 @dataclass(frozen=True)
 class Difference:
-    """A fact that two logs do not share; `first` and `second` are its values in words."""
+    """A fact that differs. `first`, `second`: its values in the two logs, in words."""
 
     what: str
     episode: int
@@ -46,12 +47,12 @@ class Difference:
     second: str
 
     def __str__(self) -> str:
-        who = "" if self.uav == TEAM else f" of UAV {self.uav}"
-        return f"{self.what}{who} at tick {self.tick} of episode {self.episode}: {self.first} against {self.second}"
+        owner = "" if self.uav == TEAM else f" of UAV {self.uav}"
+        return f"{self.what}{owner} at tick {self.tick} of episode {self.episode}: {self.first} against {self.second}"
 
 
 def facts_of(folder: str | os.PathLike[str]) -> dict[Key, Value]:
-    """Every fact in the logs of a run; RecordError when a log is damaged or contradicts itself."""
+    """Return every fact in the logs of a run; RecordError when a log is damaged or contradicts itself."""
     facts: dict[Key, Value] = {}
     for path in run_files(folder).values():
         log = Log(path)
@@ -64,7 +65,7 @@ def facts_of(folder: str | os.PathLike[str]) -> dict[Key, Value]:
 
 
 def first_difference(first: Facts, second: Facts) -> Difference | None:
-    """The earliest fact that the two do not share, or None when they share all."""
+    """Return the earliest fact that differs, or None when all are equal."""
     if first == second:
         return None
     key = min(k for k in first.keys() | second.keys() if first.get(k) != second.get(k))
@@ -72,12 +73,12 @@ def first_difference(first: Facts, second: Facts) -> Difference | None:
 
 
 def moves(facts: Facts) -> int:
-    """How many moves of UAVs the facts tell of."""
+    """Return the number of moves of UAVs in the facts."""
     return sum(rank == _RANK["action"] for _, _, rank, _ in facts)
 
 
 def cell(facts: Facts, episode: int, tick: int, uav: int) -> int:
-    """Where a UAV was at a tick; KeyError when the facts do not tell."""
+    """Return the cell of a UAV at a tick; KeyError when the facts do not hold it."""
     return int(facts[episode, tick, _RANK["cell"], uav])  # type: ignore[arg-type]  # cells are integers
 
 
@@ -143,9 +144,9 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, int | float | str) else tuple(value)
 
 
-def _hasher(w: Any) -> Keyed:
-    first = max(w.first, 1) - 1
-    yield from (((w.episode, t, _RANK["observation"], w.uav), seen) for t, seen in enumerate(w.hashes[:], first))
+def _hashes(m: Any) -> Keyed:
+    first = max(m.first, 1) - 1
+    yield from (((m.episode, t, _RANK["observation"], m.uav), value) for t, value in enumerate(m.hashes[:], first))
 
 
 _READERS: dict[str, Callable[[Any], Keyed]] = {
@@ -154,5 +155,5 @@ _READERS: dict[str, Callable[[Any], Keyed]] = {
     "overfly.TeamMetrics": _metrics,
     "overfly.Events": _events,
     "overfly.Episode": _episode,
-    "overfly.ObservationHashes": _hasher,
+    "overfly.ObservationHashes": _hashes,
 }

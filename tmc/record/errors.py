@@ -1,9 +1,11 @@
 """The errors of the flight recorder."""
 
+from tmc.kernel.errors import OverflyError
 
-class RecordError(Exception):
-    """A log that cannot be written or read: one sentence with the mend."""
+
+class RecordError(OverflyError):
+    """A log cannot be written or read. The text is one sentence with the cause and the fix."""
 
 
 class NoLogError(RecordError):
-    """What was given as a log, or as the folder of logs, is not one: there is nothing to read in it."""
+    """The given file or folder is not a log, or holds none."""

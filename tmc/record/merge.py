@@ -1,4 +1,4 @@
-"""One MCAP file of the logs of all processes of a run, in order of log time."""
+"""Merge the logs of all processes of a run into one MCAP file, in order of log time: `overfly log merge`."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from mcap.records import Attachment, Metadata
 from tmc.record.disk import open_log
 from tmc.record.errors import RecordError
 from tmc.record.mcap.export import Export
-from tmc.record.mcap.parser import DamageError, Raw, contents
+from tmc.record.mcap.parser import Message
+from tmc.record.mcap.strict import DamageError, contents
 from tmc.record.reader import Log, require_format
 
 NAME = "overfly/merged"
-"""The metadata record that a merged file has more than the files it is made of."""
+"""The metadata record that only a merged file has."""
 _PREFIX = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 _TIME = operator.attrgetter("log_time")
 
 
 @dataclass(frozen=True)
 class Merged:
-    """What came of it: how many messages of how many files.
+    """The result: messages and files.
 
-    `damage`: what is wrong with them, a sentence each. `open`: files that were not closed, as those of a run that
-    goes on or was killed.
+    `damage`: what is wrong with the files, one sentence each. `open`: files that were not closed, because the run is
+    still going on or was killed.
     """
 
     path: Path
@@ -41,7 +42,7 @@ class Merged:
 
 @dataclass
 class _Source:
-    """A file to merge. `ordered`: its times never go back, as in every log that Overfly wrote."""
+    """A file to merge. `ordered`: its log times never decrease, as in every log that Overfly writes."""
 
     process: str
     log: Log
@@ -50,8 +51,8 @@ class _Source:
     messages: int = 0
     ordered: bool = True
 
-    def by_time(self) -> Iterable[Raw]:
-        """Its intact messages by log time; those of one time in the order of the file."""
+    def by_time(self) -> Iterable[Message]:
+        """Return its intact messages by log time; messages of the same time in the order of the file."""
         return self.log.raw() if self.ordered else sorted(self.log.raw(), key=_TIME)
 
 
@@ -60,8 +61,8 @@ def merge(
 ) -> Merged:
     """Write all intact messages of `files` ({process: log}) to `out`, by log time, then in the order of the files.
 
-    `prefix` goes before every topic: `A` makes `/A/tmc/sync`. `show` gets the messages written, and all of them.
-    What is damaged is merged up to the damage. Raises RecordError when nothing can be read or `out` not be written.
+    `prefix` goes before every topic: `A` makes `/A/tmc/sync`. `show` gets the number of messages written, and of all
+    messages. A damaged file is merged up to the damage. RecordError when no file can be read, or `out` not be written.
     """
     before = topic_prefix(prefix)
     sources, damage = _sources(files)
@@ -72,8 +73,8 @@ def merge(
         _carry_over(sources, export, before)
         for process, raw in _in_order(sources):
             export.put(
-                before + raw.topic, raw.schema, raw.described, raw.data, raw.log_time, raw.publish_time,
-                raw.sequence, process,
+                before + raw.topic, raw.schema, raw.definition.data if raw.definition else b"", raw.data, raw.log_time,
+                raw.publish_time, raw.sequence, process,
             )  # fmt: skip
             written += 1
             show(written, total)
@@ -84,20 +85,20 @@ def merge(
 
 
 def topic_prefix(prefix: str) -> str:
-    """`/A` of `A`, `A/` or `/A/`; empty of nothing. RecordError for what viewers would not take in a topic."""
+    """Return `/A` for `A`, `A/` or `/A/`, empty for an empty prefix. RecordError for what viewers reject in a topic."""
     bare = prefix.strip("/")
     if bare and not _PREFIX.fullmatch(bare):
-        raise RecordError(f"--prefix {prefix} is no part of a topic: use letters, digits, _, - and / between them")
+        raise RecordError(f"--prefix {prefix} is not part of a topic: use letters, digits, _, - and / between them")
     return f"/{bare}" if bare else ""
 
 
 def _sources(files: Mapping[str, Path]) -> tuple[list[_Source], list[str]]:
-    """The files that can be read, and sentences on those that cannot; RecordError when that is all of them."""
+    """Return the files that can be read, and a sentence on each other; RecordError when none can be read."""
     sources, unreadable = [], []
     for process, path in files.items():
         try:
             sources.append(_survey(process, path))
-        except RecordError as error:  # empty, or no log at all: the rest of the run is still worth merging
+        except RecordError as error:  # empty, or not a log: the rest of the run can still be merged
             unreadable.append(str(error))
     if not sources:
         raise RecordError("; ".join(unreadable))
@@ -119,12 +120,12 @@ def _survey(process: str, path: Path) -> _Source:
                     source.ordered &= all(a <= b for a, b in pairwise(times))
                     source.messages, last = source.messages + len(item), times[-1]
     except DamageError:
-        pass  # `Log.damage` has it in words
+        pass  # `Log.damage` describes it
     return source
 
 
 def _carry_over(sources: list[_Source], export: Export, prefix: str) -> None:
-    """Metadata and attachments. Attachments of two processes that share a name but not their data say whose."""
+    """Copy metadata and attachments. Attachments of one name with different data get the process before the name."""
     for source in sources:
         for record in source.metadata:
             export.add_metadata(record.name, record.metadata)
@@ -136,8 +137,8 @@ def _carry_over(sources: list[_Source], export: Export, prefix: str) -> None:
             export.attach(name, a.media_type, a.data, a.log_time, a.create_time)
 
 
-def _in_order(sources: list[_Source]) -> Iterator[tuple[str, Raw]]:
-    def told(source: _Source) -> Iterator[tuple[str, Raw]]:
+def _in_order(sources: list[_Source]) -> Iterator[tuple[str, Message]]:
+    def labelled(source: _Source) -> Iterator[tuple[str, Message]]:
         return ((source.process, raw) for raw in source.by_time())
 
-    return heapq.merge(*map(told, sources), key=lambda pair: pair[1].log_time)
+    return heapq.merge(*map(labelled, sources), key=lambda pair: pair[1].log_time)

@@ -1,9 +1,8 @@
-"""Reads logs back: finished, still written, or cut off by a crash. What is given out is intact; nothing is guessed."""
+"""Read logs: finished, still written, or cut off by a crash. Only what is intact is given out; nothing is guessed."""
 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -18,16 +17,15 @@ from mcap.records import Attachment, Metadata
 from tmc.record.channels import ACTIVE, FORMAT
 from tmc.record.disk import open_log
 from tmc.record.errors import NoLogError, RecordError
-from tmc.record.mcap.parser import MAGIC, RECOVERED, DamageError, Raw, contents
-from tmc.record.mcap.salvage import goes_on
+from tmc.record.mcap.parser import MAGIC, RECOVERED, UNKNOWN_LENGTH, Message
+from tmc.record.mcap.salvage import intact_behind
+from tmc.record.mcap.strict import DamageError, contents
 from tmc.record.schemas import message_class
-
-_LOG_NAME = re.compile(rf"(tmc|learner|uav-\d+)\.mcap({re.escape(ACTIVE)})?")
 
 
 @dataclass(frozen=True, slots=True)
 class LogMessage:
-    """A message of a log. `log_time`, `publish_time`: ns; `sequence`: a counter a topic; `message`: protobuf."""
+    """A decoded message. `log_time`, `publish_time`: ns; `sequence`: a counter per topic; `message`: protobuf."""
 
     topic: str
     log_time: int
@@ -37,7 +35,10 @@ class LogMessage:
 
 
 class Log:
-    """One log file. RecordError when it is missing, empty, not MCAP, or of another format; damage is noted instead."""
+    """Read one log file.
+
+    Raises RecordError when it is missing, empty, not MCAP, or of another log format; `damage` has all else.
+    """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -46,24 +47,24 @@ class Log:
         self._read = False
         self._finished = False
 
-    def raw(self, topics: Collection[str] | None = None) -> Iterator[Raw]:
-        """All intact messages in file order, of these topics only when given, not decoded."""
+    def raw(self, topics: Collection[str] | None = None) -> Iterator[Message]:
+        """Yield the intact messages in file order, not decoded; of these topics only, when given."""
         for item in self._items():
             if isinstance(item, list):
                 yield from (raw for raw in item if topics is None or raw.topic in topics)
 
     def entries(self, topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-        """All intact messages in file order, of these topics only when given."""
+        """Yield the intact messages in file order, decoded; of these topics only, when given."""
         for raw in self.raw(topics):
             yield LogMessage(raw.topic, raw.log_time, raw.publish_time, raw.sequence, decode(raw))
 
     @property
     def damage(self) -> str | None:
-        """What is wrong with the file and where, or None: nothing behind that place is read.
+        """What is wrong with the file and where; None when nothing is. Nothing behind the damage is read.
 
-        A file that is still written is not damaged for having no end. Reads the whole file unless that was done.
+        A file that is still written is not damaged because it has no end. Reads the whole file on first use.
         """
-        self._know()
+        self._read_once()
         if self._damage is not None:
             return f"{self.path.name}: {self._damage}"
         if not self._finished and not self.path.name.endswith(ACTIVE):
@@ -73,7 +74,7 @@ class Log:
     @property
     def cut(self) -> bool:
         """True when all that is wrong is that the file ends too early, as after a kill."""
-        self._know()
+        self._read_once()
         return not self._finished and (self._damage is None or self._damage.cut)
 
     @property
@@ -84,11 +85,11 @@ class Log:
     @property
     def finished(self) -> bool:
         """True when the file was closed in order and is intact to its end."""
-        self._know()
+        self._read_once()
         return self._finished
 
     def metadata(self) -> dict[str, str]:
-        """All facts in the file; where incarnations of a process differ, the last one's."""
+        """Return all metadata; where incarnations of a process differ, those of the last one."""
         found: dict[str, str] = {}
         for item in self._items():
             if isinstance(item, Metadata):
@@ -99,26 +100,26 @@ class Log:
     def lost(self) -> dict[str, str]:
         """What is missing in a file that was recovered from a damaged one (`overfly log recover`); empty otherwise.
 
-        It stands before the first chunk, so no more than that is read.
+        It stands before the first chunk, so nothing behind that is read.
         """
         head = takewhile(lambda item: not isinstance(item, list), self._items())
-        told = [item.metadata for item in head if isinstance(item, Metadata) and item.name == RECOVERED]
-        return {key: "; ".join(facts[key] for facts in told) for key in (told[0] if told else {})}
+        losses = [item.metadata for item in head if isinstance(item, Metadata) and item.name == RECOVERED]
+        return {key: "; ".join(facts[key] for facts in losses) for key in (losses[0] if losses else {})}
 
     def extras(self) -> list[Metadata | Attachment]:
-        """What there is besides messages: metadata records, of each incarnation of the process, and attachments."""
+        """Return what is not a message: attachments, and the metadata of each incarnation of the process."""
         return [item for item in self._items() if isinstance(item, Metadata | Attachment)]
 
     def attachments(self) -> list[Attachment]:
-        """The files within the file: name, media_type, data."""
+        """Return the attached files: name, media_type, data."""
         return [item for item in self.extras() if isinstance(item, Attachment)]
 
-    def _know(self) -> None:
+    def _read_once(self) -> None:
         if not self._read:
             for _ in self._items():
                 pass
 
-    def _items(self) -> Iterator[list[Raw] | Metadata | Attachment | None]:
+    def _items(self) -> Iterator[list[Message] | Metadata | Attachment | None]:
         damage, finished = None, False
         try:
             with open_log(self.path) as file:
@@ -128,12 +129,12 @@ class Log:
                     yield item
         except DamageError as error:
             damage = error
-            if error.size and goes_on(self.path, error.at, error.size):
-                damage = DamageError(error.at, "the length of a record is damaged")
+            if error.size and intact_behind(self.path, error.at, error.size):
+                damage = DamageError(error.at, UNKNOWN_LENGTH)
         self._damage, self._finished, self._read = damage, finished, True
 
 
-def require_format(path: Path, item: list[Raw] | Metadata | Attachment | None) -> None:
+def require_format(path: Path, item: list[Message] | Metadata | Attachment | None) -> None:
     """Raise RecordError if an item of a log is metadata that states another version of the log format."""
     if isinstance(item, Metadata) and item.name.startswith("overfly/"):
         found = item.metadata.get("format", FORMAT)
@@ -151,12 +152,14 @@ def _check_start(path: Path) -> None:
         raise NoLogError(f"{path} is not an MCAP file: give one that ends in .mcap or .mcap{ACTIVE}")
 
 
-def decode(raw: Raw) -> Any:
-    """The protobuf message: of our own class where we know the schema, else of the class that the file describes."""
+def decode(raw: Message) -> Any:
+    """Return the protobuf message: of Overfly's class where the schema is known, else of the class in the file."""
     try:
-        return _class(raw.schema, raw.described).FromString(raw.data)
+        return _class(raw.schema, raw.definition.data if raw.definition else b"").FromString(raw.data)
     except (DecodeError, KeyError, TypeError):
-        raise RecordError(f"a message on {raw.topic} is no {raw.schema}: the log was made by something else") from None
+        raise RecordError(
+            f"a message on {raw.topic} is not an {raw.schema}: the log was made by another program"
+        ) from None
 
 
 @cache
@@ -171,41 +174,13 @@ def _class(schema: str, described: bytes) -> Any:
 
 
 def read(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Iterator[LogMessage]:
-    """All intact messages of a log in file order; `Log` also tells of damage."""
+    """Yield the intact messages of a log in file order; `Log` also reports damage."""
     return Log(path).entries(topics)
-
-
-def run_files(folder: str | os.PathLike[str]) -> dict[str, Path]:
-    """{process: its log} of a run, `tmc` and `learner` first; NoLogError when the folder holds none.
-
-    Where both names exist, a resumed log is just taking over from the finished one, and holds all of it, unless it is
-    empty.
-    """
-    folder = Path(folder)
-    paths, why = list[Path](), "tmc.mcap and others"
-    try:
-        paths = sorted(p for p in folder.iterdir() if _LOG_NAME.fullmatch(p.name) and p.is_file())
-    except OSError as error:
-        why = str(error.strerror)
-    if not paths:
-        raise NoLogError(f"{folder} holds no logs of a run ({why}): give the folder of a run")
-    found: dict[str, Path] = {}
-    for path in paths:
-        name = path.name.partition(".")[0]
-        if name not in found or path.stat().st_size or not found[name].stat().st_size:
-            found[name] = path
-    return dict(sorted(found.items(), key=lambda item: (item[0].startswith("uav"), item[0] != "tmc", item[0])))
-
-
-def logs_in(path: str | os.PathLike[str]) -> dict[str, Path]:
-    """{process: its log} of the folder of a run, or of what was given as a single log."""
-    path = Path(path)
-    return run_files(path) if os.path.isdir(path) else {path.name.partition(".")[0]: path}  # noqa: PTH112  never raises
 
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One topic: messages, bytes of payload before compression, and first and last log time (ns)."""
+    """One topic: messages, payload before compression in bytes, and first and last log time, ns."""
 
     schema: str
     count: int
@@ -216,7 +191,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class Info:
-    """A log at a glance: `bytes` on disk; `first` and `last` log time (ns), None when it holds no message."""
+    """A summary of a log: `bytes` on disk; `first` and `last` log time, ns, None when it holds no message."""
 
     path: Path
     bytes: int
@@ -234,7 +209,7 @@ class Info:
 
 
 def info(path: str | os.PathLike[str]) -> Info:
-    """Count what a log holds."""
+    """Count the messages and bytes of each topic of a log."""
     log = Log(path)
     topics: dict[str, TopicInfo] = {}
     for raw in log.raw():

@@ -1,7 +1,7 @@
-"""The schemas of the log: our own protobuf types, built here from a table, and foxglove's, imported when first used.
+"""The schemas of the log: Overfly's protobuf types, built from a table, and foxglove's, imported when first used.
 
-`overfly.proto` is the readable copy; a test holds the two together. Fields are only ever added, at the end of a type,
-so that every log stays readable: their numbers are their places in the table.
+`overfly.proto` is the readable copy; a test compares the two. The number of a field is its position in the table, so
+fields are only added at the end of a type, and every log stays readable.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TYPES: dict[str, str] = {
 
 
 def file_descriptor() -> Any:
-    """The FileDescriptorProto of the table."""
+    """Return the FileDescriptorProto of the table."""
     file = descriptor_pb2.FileDescriptorProto(name="overfly.proto", package=PACKAGE, syntax="proto3")
     for name, fields in TYPES.items():
         message = file.message_type.add(name=name)
@@ -65,7 +65,7 @@ def _add_field(message: Any, number: int, kind: str, name: str) -> None:
 
 
 def _pool() -> Any:
-    """A pool of our own: nothing global changes when this module is imported."""
+    """Return a pool of Overfly's own, so that importing this module changes nothing global."""
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file_descriptor().SerializeToString())
     return pool
@@ -95,7 +95,7 @@ UavTick = _own("UavTick")
 
 @cache
 def message_class(schema: str) -> Any:
-    """The class of a schema, such as `overfly.Sync` or `foxglove.Grid`; RecordError when nobody knows it."""
+    """Return the class of a schema, such as `overfly.Sync` or `foxglove.Grid`; RecordError when it is not known."""
     package, _, name = schema.partition(".")
     if package == PACKAGE and name in TYPES:
         return _own(name)
@@ -108,12 +108,12 @@ def message_class(schema: str) -> Any:
 
 
 def foxglove(name: str) -> Any:
-    """The generated module of one foxglove type: importing each costs milliseconds, so only those that are used."""
+    """Import the generated module of one foxglove type. Each import takes milliseconds, so only used ones are."""
     return importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2")
 
 
 def schema_bytes(schema: str) -> bytes:
-    """What MCAP stores of a protobuf schema: a FileDescriptorSet with all that it depends on."""
+    """Return what MCAP stores of a protobuf schema: a FileDescriptorSet with all types that it depends on."""
     files = descriptor_pb2.FileDescriptorSet()
     _collect(message_class(schema).DESCRIPTOR.file, files, set())
     return bytes(files.SerializeToString())

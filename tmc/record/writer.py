@@ -1,7 +1,7 @@
-"""Writes the log of one process: one MCAP file, one writer, one thread.
+"""Write the log of one process: one MCAP file, one writer, one thread.
 
-The file is called `<name>.mcap.active` while it grows, and `<name>.mcap` once it is finished. A message is in the file
-after `flush()`, which ends the chunk and hands it to the system: what kill -9 can take is what came after the last one.
+The file is named `<name>.mcap.active` while it grows, and `<name>.mcap` once it is finished. A message is in the file
+after `flush()`, which ends the chunk and passes it to the system. A kill -9 loses only what came after the last flush.
 """
 
 from __future__ import annotations
@@ -15,15 +15,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from mcap.records import Attachment
+
 from tmc.kernel.config import JournalConfig
 from tmc.record import builders, channels, disk, schemas
 from tmc.record.errors import RecordError
+from tmc.record.mcap.parser import PROFILE, RECOVERED
+from tmc.record.mcap.recover import keep_damaged
 from tmc.record.mcap.writer import mcap_writer
+from tmc.record.reader import Log
+from tmc.record.run_folder import active_name
 
 
 @dataclass(slots=True)
 class _Channel:
-    """A channel of this file. `sequence` is the next number: 32 bits, and a gap shows that messages are missing."""
+    """A channel of this file. `sequence` is the next number, 32 bits; a gap shows that messages are missing."""
 
     id: int
     schema: str
@@ -31,12 +37,12 @@ class _Channel:
 
 
 class LogWriter:
-    """The log of one process.
+    """Write the log of one process. A context: leaving it finishes the file.
 
-    `path` is the finished file's, `process` a name such as `tmc` or `uav-003`, `metadata` facts for the readers.
-    `resume`: go on with what an earlier incarnation of the process left behind, finished or not, instead of refusing
-    to. `clock` gives the wall clock in ns, `timer` a clock in s that never goes back. Raises RecordError for a file
-    that cannot be written or is there already; after one, nothing more is written.
+    `path`: of the finished file. `process`: a name such as `tmc` or `uav-003`. `metadata`: facts for the readers.
+    `resume`: continue the log that an earlier incarnation of the process left, finished or not, instead of refusing to.
+    `clock`: the wall clock, ns. `timer`: a clock that never goes back, s. Raises RecordError when the file cannot be
+    written or exists already. After a RecordError, nothing more is written.
     """
 
     def __init__(
@@ -51,21 +57,21 @@ class LogWriter:
         timer: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path, self.process = Path(path), process
-        self.active = self.path.with_name(self.path.name + channels.ACTIVE)
+        self.active = active_name(self.path)
         self._journal, self._clock, self._timer = journal, clock, timer
         self._channels: dict[str, _Channel] = {}
         self._schemas: dict[str, int] = {}
         self._last, self._closed = 0, ""
         self._flushed, self._synced = timer(), False
         try:
-            old = disk.left_behind(self.path, resume)
-            name = self.active.with_name(self.active.name + ".new") if old else self.active
-            with ExitStack() as held:  # nobody else may go on with the old one meanwhile
-                held.enter_context(disk.open_held(old, "rb") if old else nullcontext())
-                self._file = disk.open_held(name, "wb" if old else "xb")
-                self._old = held.pop_all()
+            old = disk.previous_log(self.path, resume)
+            name = self.active.with_name(self.active.name + disk.NEW_SUFFIX) if old else self.active
+            with ExitStack() as locks:  # no other process may resume the old log meanwhile
+                locks.enter_context(disk.open_locked(old, "rb") if old else nullcontext())
+                self._file = disk.open_locked(name, "wb" if old else "xb")
+                self._old = locks.pop_all()
         except OSError as error:
-            raise RecordError(disk.unwritable(self.path, error)) from None
+            raise RecordError(disk.why_unwritable(self.path, error)) from None
         self._writer = mcap_writer(self._file, journal.chunk)
         try:
             self._start(dict(metadata), old, name)
@@ -75,25 +81,46 @@ class LogWriter:
 
     def _start(self, metadata: dict[str, str], old: Path | None, name: Path) -> None:
         with self._guard():
-            self._writer.start(profile="overfly")
+            self._writer.start(profile=PROFILE)
             if old is not None:
-                from tmc.record import resume  # noqa: PLC0415  # a fresh start does not pay for the reader
-
-                resume.copy(old, self)
-            # Names are unique to the process, so that the files of a run can be merged.
+                self._copy(old)
+            # Names are unique per process, so that the files of a run can be merged.
             facts = {"format": channels.FORMAT, "process": self.process, "clock": "wall"}
             self.note(f"overfly/{self.process}", facts | metadata)
             self.flush(fsync=old is not None)
             if old is not None:
                 name.replace(self.active)
                 self.path.unlink(missing_ok=True)
-                disk.sync_folder(self.path.parent)  # the new file goes by its name even after a power cut
+                disk.sync_folder(self.path.parent)  # the new file keeps its name after a power cut
             self._old.close()
 
-    def write(self, topic: str, message: Any, publish_time: int | None = None) -> int:
-        """Log a message of the schema that the table has for the topic; gives back its log time.
+    def _copy(self, old: Path) -> None:
+        """Copy all intact messages, attachments and metadata of `old`, with their numbers and times.
 
-        `publish_time`: the sender's wall clock in ns; the log time when left out. Flushes when that is due.
+        The incomplete end that a kill leaves is dropped. After any other damage, the old file is kept as `*.damaged-1`,
+        since intact chunks may follow the damage, and the new log says so.
+        """
+        if old.stat().st_size == 0:
+            return
+        log = Log(old)
+        if log.lost:
+            self.note(RECOVERED, log.lost)
+        for extra in log.extras():
+            if isinstance(extra, Attachment):
+                self.attach(extra.name, extra.media_type, extra.data)
+            elif extra.name != RECOVERED:
+                self.note(extra.name, extra.metadata)
+        for raw in log.raw():
+            self.put(raw.topic, raw.data, raw.log_time, raw.publish_time, raw.sequence)
+        if log.damage is not None and not log.still_open:
+            kept = keep_damaged(old).name
+            self.log("error", f"{log.damage}: this incarnation resumes before that; the file is kept as {kept}")
+
+    def write(self, topic: str, message: Any, publish_time: int | None = None) -> int:
+        """Write a message to a topic and return its log time, ns. Flushes when that is due.
+
+        `message`: of the schema that the table has for the topic. `publish_time`: the sender's wall clock, ns; by
+        default the log time.
         """
         channel = self._channels.get(topic) or self._register(topic)
         if message.DESCRIPTOR.full_name != channel.schema:
@@ -107,7 +134,7 @@ class LogWriter:
         return now
 
     def put(self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int) -> None:
-        """Log bytes of the topic's schema with times and number as given: for a log that is copied."""
+        """Write the bytes of a message with the given times (ns) and number: for a log that is copied."""
         channel = self._channels.get(topic) or self._register(topic)
         self._check_open()
         try:
@@ -128,29 +155,29 @@ class LogWriter:
         return self._channels[topic]
 
     def now(self) -> int:
-        """The wall clock in ns, held back where it went back: log times never decrease within a file."""
+        """Return the wall clock, ns, or the last log time if that is later: log times never decrease within a file."""
         self._last = max(self._last, self._clock())
         return self._last
 
     def log(self, level: str, text: str) -> None:
-        """Say something on `/log`; `level` is one of `builders.LEVELS`."""
+        """Write a line to the topic `/log`; `level` is one of `builders.LEVELS`."""
         self.write("/log", builders.log_message(level, text, self.process, self.now()))
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Put a file into the log, such as the config or the map."""
+        """Attach a file to the log, such as the config or the map."""
         now = self.now()
         with self._guard():
             self._writer.add_attachment(now, now, name, media_type, data)
 
     def note(self, name: str, facts: dict[str, str]) -> None:
-        """Put metadata into the log."""
+        """Write metadata to the log."""
         with self._guard():
             self._writer.add_metadata(name, facts)
 
     def flush(self, *, fsync: bool = False) -> None:
-        """End the chunk and hand it to the system; with `fsync`, also wait until the disk has it (power cuts)."""
+        """End the chunk and pass it to the system; with `fsync`, wait until it is on the disk (power cuts)."""
         with self._guard():
-            if not os.fstat(self._file.fileno()).st_nlink:  # nobody will ever read it
+            if not os.fstat(self._file.fileno()).st_nlink:  # no process will ever read it
                 raise FileNotFoundError(errno.ENOENT, "it was removed")
             self._writer.flush()
             if fsync:
@@ -158,12 +185,12 @@ class LogWriter:
         self._flushed = self._timer()
 
     def maybe_flush(self) -> None:
-        """Flush when the configured time has passed since the last flush: call it in every idle round."""
+        """Flush when `journal.flush_interval` has passed since the last flush: call it in every idle round."""
         if self._timer() - self._flushed >= self._journal.flush_interval:
             self.flush()
 
     def close(self) -> None:
-        """Finish the file and give it its name. A file that failed before stays `.active`, readable up to there."""
+        """Finish the file and give it its name. After a failure it stays `.active`, readable up to the failure."""
         if self._closed:
             return
         with self._guard():
@@ -171,7 +198,7 @@ class LogWriter:
             self._file.flush()
             self._sync()
             self.active.rename(self.path)
-            self._file.close()  # and so let go of it, under its new name
+            self._file.close()  # releases the lock, under the new name
         self._closed = f"{self.path} is closed: write before close()"
 
     def __enter__(self) -> Self:
@@ -193,8 +220,8 @@ class LogWriter:
             raise RecordError(self._closed)
 
     def _fail(self, error: OSError) -> RecordError:
-        """Half a chunk may be in the file now, so nothing may follow it: give the file up as it is."""
-        self._closed = disk.unwritable(self.path, error)
+        """Write nothing more: half a chunk may be in the file, so nothing may follow it."""
+        self._closed = disk.why_unwritable(self.path, error)
         self._give_up()
         return RecordError(self._closed)
 
@@ -205,6 +232,6 @@ class LogWriter:
 
     def _sync(self) -> None:
         os.fsync(self._file.fileno())
-        if not self._synced:  # once, so that the folder knows the file
+        if not self._synced:  # once, so that the name of the file is on the disk
             disk.sync_folder(self.path.parent)
             self._synced = True

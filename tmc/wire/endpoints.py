@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.text import printable
 
 LONGEST_PATH = 107 if sys.platform == "linux" else 103
@@ -26,7 +27,7 @@ _TCP = re.compile(r"tcp://(?:\[(?P<ipv6>[^][/]+)\]|(?P<host>[^][/:;\s]+)):(?P<po
 _HOW = "write tcp://HOST:PORT or ipc://PATH"
 
 
-class EndpointError(ValueError):
+class EndpointError(OverflyError, ValueError):
     """An endpoint that cannot be used: one sentence with the fix."""
 
 

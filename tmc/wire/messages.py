@@ -1,9 +1,9 @@
 """Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is intact.
 
-`docs/protocol.md` is the text to this table. PolicySpec sends what: UAV -> TMC: Hello, Record, Alive, PolicyRequest,
-Bye. TMC -> UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
-TMC -> learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status.
-UAV -> UAV, passed on by the TMC where the two share no memory: Beacon.
+`docs/reference/protocol.md` is the text to this table. UAV -> TMC: Hello, Record, Alive, PolicyRequest, Bye. TMC ->
+UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye. TMC ->
+learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status. UAV -> UAV, passed on by
+the TMC where the two share no memory: Beacon.
 """
 
 from __future__ import annotations

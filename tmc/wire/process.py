@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from tmc.kernel.errors import OverflyError
 from tmc.kernel.text import printable
 
 DONE, FAILED, USAGE, FENCED, STOPPED = 0, 1, 2, 75, 143
@@ -30,7 +31,7 @@ REPEAT_S = 5.0
 _PR_SET_PDEATHSIG, _PR_GET_CHILD_SUBREAPER = 1, 37
 
 
-class FailedError(Exception):
+class FailedError(OverflyError):
     """The work failed though the command was right: one sentence for the user, exit code 1."""
 
 

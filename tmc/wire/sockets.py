@@ -1,8 +1,8 @@
 """The sockets: the TMC binds, everybody else connects. Only this module and the services know ZeroMQ.
 
-Options follow what was measured (docs/architecture.md): no linger, since it hangs at exit; a bounded queue, since the
-mark counts messages and not bytes; a limit on each part; heartbeats on the connecting side only, because a bound ROUTER
-with heartbeats can be aborted by a peer that fills its mark and leaves.
+Options follow what was measured (docs/explanation/architecture.md): no linger, since it hangs at exit; a bounded queue,
+since the mark counts messages and not bytes; a limit on each part; heartbeats on the connecting side only, because a
+bound ROUTER with heartbeats can be aborted by a peer that fills its mark and leaves.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""`overfly verify chaos`: missions that are disturbed on purpose, and what is held against their logs."""
+"""`overfly verify chaos`: missions under injected faults, and the checkers of their logs."""

@@ -1,4 +1,4 @@
-"""Compares the acknowledgements that UAVs logged with the journal: no record is lost, and none is there twice."""
+"""Compares the acknowledgements that UAVs logged with the journal: no record is lost, and none is journalled twice."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tmc.center.journal import journal_in
 from tmc.record.builders import record_digest, to_record
 from tmc.record.channels import ACTIVE
 from tmc.record.reader import Log
+from tmc.record.run_folder import RunFolder
 
-Number = tuple[int, int]
+RecordId = tuple[int, int]
 """A record: UAV and sequence."""
 
 
 @dataclass(frozen=True)
 class DeliveryReport:
-    """What became of the records of a mission, as counts, and what was flown by its journal.
+    """Counts of the records of a mission, and of what was flown according to its journal.
 
-    `lost`: acknowledged, and not in the journal with the same digest; `doubled`: there more than once.
+    `lost`: acknowledged, but not in the journal with the same digest. `doubled`: journalled more than once.
     """
 
     acknowledged: int
@@ -34,10 +34,10 @@ class DeliveryReport:
     updates: int
 
 
-def check_delivery(out: Path, known: Collection[Number] = ()) -> DeliveryReport:
-    """Compare the journal of a run with all that was acknowledged in it; `known`: records that are known to be lost."""
-    digests: dict[Number, str] = {}
-    times: Counter[Number] = Counter()
+def check_delivery(out: Path, lost_before: Collection[RecordId] = ()) -> DeliveryReport:
+    """Compare the journal of a run with all acknowledgements; `lost_before`: records already found lost."""
+    digests: dict[RecordId, str] = {}
+    times: Counter[RecordId] = Counter()
     flown = Counter[str]()
     for entry in Log(_journal(out)).entries():
         kind, message = entry.message.DESCRIPTOR.name, entry.message
@@ -51,7 +51,7 @@ def check_delivery(out: Path, known: Collection[Number] = ()) -> DeliveryReport:
         elif kind == "Episode":
             flown["episodes"] += message.phase == "end"
     acks = set(_acks(out))
-    lost = {number for number, digest in acks if digests.get(number) != digest} | {*known}
+    lost = {number for number, digest in acks if digests.get(number) != digest} | {*lost_before}
     doubled = sum(count > 1 for count in times.values())
     acknowledged = {number for number, _ in acks}
     return DeliveryReport(
@@ -60,18 +60,18 @@ def check_delivery(out: Path, known: Collection[Number] = ()) -> DeliveryReport:
 
 
 def _journal(out: Path) -> Path:
-    found = journal_in(out)
+    found = RunFolder(out).existing_journal()
     assert found is not None, f"{out} holds no journal"
     return found
 
 
 def ack_files(out: Path) -> list[Path]:
-    """Where UAVs have acknowledged."""
-    return sorted((out / "acks").glob("uav-*.txt"))
+    """Return the files of the UAVs' acknowledgements in a run folder."""
+    return sorted(RunFolder(out).acks.glob("uav-*.txt"))
 
 
-def _acks(out: Path) -> Iterable[tuple[Number, str]]:
-    """((uav, sequence), digest) of each line."""
+def _acks(out: Path) -> Iterable[tuple[RecordId, str]]:
+    """Yield ((uav, sequence), digest) of each acknowledgement."""
     for path in ack_files(out):
         uav = int(path.stem.removeprefix("uav-"))
         for line in path.read_text("utf-8").splitlines():
@@ -81,18 +81,18 @@ def _acks(out: Path) -> Iterable[tuple[Number, str]]:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The journal as a kill of the TMC left it, and the last record that each UAV had acknowledged to by then.
+    """The journal as a kill of the TMC left it, and the last acknowledged record of each UAV by then.
 
-    A record that is lost with a kill may be flown again, the very same: only here it can be seen that it was lost.
+    A record lost by a kill may be flown again, identically, so its loss shows only here.
     """
 
     journal: Path
     acknowledged: dict[int, int]
 
     @classmethod
-    def take(cls, out: Path) -> Snapshot:
-        """Keep the journal under another name: the next TMC writes a new file."""
-        link = out / "acks" / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
+    def capture(cls, out: Path) -> Snapshot:
+        """Keep the journal under another name, because the next TMC writes a new file."""
+        link = RunFolder(out).acks / f"killed-{time.monotonic_ns()}.mcap{ACTIVE}"
         os.link(_journal(out), link)
         acknowledged = {}
         for path in ack_files(out):
@@ -101,11 +101,11 @@ class Snapshot:
                 acknowledged[int(path.stem.removeprefix("uav-"))] = int(lines[-1].split()[0])
         return cls(link, acknowledged)
 
-    def lost(self) -> set[Number]:
-        """Records that were acknowledged and did not survive; the file is dropped."""
+    def lost(self) -> set[RecordId]:
+        """Return the acknowledged records that did not survive; delete the file."""
         counts: Counter[int] = Counter()
         for raw in Log(self.journal).raw():
             if raw.schema == "overfly.FlightRecord":
-                counts[int(raw.topic.split("/")[2])] += 1  # a UAV's records are numbered from 0, without gap
+                counts[int(raw.topic.split("/")[2])] += 1  # a UAV's records are numbered from 0 without a gap
         self.journal.unlink()
         return {(uav, n) for uav, last in self.acknowledged.items() for n in range(counts[uav], last + 1)}

@@ -1,4 +1,4 @@
-"""The wire between the TMC and its clients, which a trial can cut: a forwarder of bytes before each endpoint."""
+"""A proxy between the TMC and its clients that a trial can cut: it forwards bytes before each endpoint."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from random import Random
 from deploy.run.plan import Plan
 from tmc.wire.sockets import learner_endpoint
 
-SIZE = 65_536
-"""Bytes that are passed on at once."""
+CHUNK_BYTES = 65_536
+"""Most bytes that are forwarded at once."""
 IPC = "ipc://"
 
 Pair = tuple[socket.socket, socket.socket]
 
 
 class Forwarder:
-    """Listens at the path `front`, and passes on to the path `back` what comes in, and back; each in a thread."""
+    """Forwards bytes between clients of the socket path `front` and the socket path `back`, both ways, in threads."""
 
     def __init__(self, front: Path, back: Path) -> None:
-        self.back = back
+        self.note_recovery = back
         self._pairs: set[Pair] = set()
         self._lock, self._closed_until = threading.Lock(), 0.0
         self._listener = socket.socket(socket.AF_UNIX)
@@ -42,7 +42,7 @@ class Forwarder:
 
     def _connect(self, client: socket.socket) -> None:
         server = socket.socket(socket.AF_UNIX)
-        if time.monotonic() < self._closed_until or server.connect_ex(str(self.back)):
+        if time.monotonic() < self._closed_until or server.connect_ex(str(self.note_recovery)):
             client.close()
             server.close()
             return
@@ -50,16 +50,16 @@ class Forwarder:
         with self._lock:
             self._pairs.add(pair)
         for one, other in (pair, pair[::-1]):
-            threading.Thread(target=self._pass_on, args=(pair, one, other), daemon=True).start()
+            threading.Thread(target=self._forward, args=(pair, one, other), daemon=True).start()
 
-    def _pass_on(self, pair: Pair, source: socket.socket, sink: socket.socket) -> None:
+    def _forward(self, pair: Pair, source: socket.socket, sink: socket.socket) -> None:
         with suppress(OSError):
-            while data := source.recv(SIZE):
+            while data := source.recv(CHUNK_BYTES):
                 sink.sendall(data)
         self._drop(pair)
 
     def _drop(self, pair: Pair) -> None:
-        """Close both sides; the threads that wait for them wake up."""
+        """Close both sides, which wakes the threads that wait for them."""
         with self._lock:
             self._pairs.discard(pair)
         for sock in pair:
@@ -68,7 +68,7 @@ class Forwarder:
             sock.close()
 
     def cut(self, seconds: float, draw: Random) -> None:
-        """Drop some connections, or all, and take no new one for `seconds`."""
+        """Drop some connections, or all, and refuse new ones for `seconds`."""
         self._closed_until = time.monotonic() + seconds
         share = draw.choice((0.5, 1.0))
         with self._lock:
@@ -77,7 +77,7 @@ class Forwarder:
             self._drop(pair)
 
     def close(self) -> None:
-        """Drop everything, for good."""
+        """Drop all connections and stop listening."""
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -89,7 +89,7 @@ class Forwarder:
 
 
 class CuttableProxy:
-    """Both endpoints of a plan, with a forwarder before each; `plan` has the clients connect to these."""
+    """A forwarder before each endpoint of a plan. `plan`: the same plan, in which clients connect to the forwarders."""
 
     def __init__(self, plan: Plan) -> None:
         ends = [plan.endpoint, learner_endpoint(plan.endpoint)]
@@ -105,7 +105,7 @@ class CuttableProxy:
             forwarder.cut(seconds, Random(draw))
 
     def close(self) -> None:
-        """End both forwarders."""
+        """Close both forwarders."""
         for forwarder in self.forwarders:
             forwarder.close()
 
@@ -115,7 +115,7 @@ def _path(endpoint: str) -> Path:
 
 
 def _redirected(command: Sequence[str], endpoint: str) -> tuple[str, ...]:
-    """The same command, with another endpoint to connect to."""
+    """Return the command with another endpoint to connect to."""
     return tuple(
         endpoint if before == "--connect" else word for before, word in zip(("", *command), command, strict=False)
     )

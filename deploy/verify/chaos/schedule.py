@@ -1,4 +1,4 @@
-"""The faults that are still to come, and what came of those before: it lasts for several missions, if need be."""
+"""The schedule of faults, and the results of those injected so far. It may last for several missions."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.run.progress import clock
-from deploy.verify.chaos.checker import Number, Snapshot
+from deploy.verify.chaos.checker import RecordId, Snapshot
 from deploy.verify.chaos.faults import POWER, Fault
 from tmc.wire import messages as m
 
 
 @dataclass
 class Growth:
-    """By how much ticks and updates have grown since the first status was taken."""
+    """The growth of ticks and updates since the first status."""
 
     ticks: int = 0
     updates: int = 0
     last: m.Status | None = None
 
-    def take(self, status: m.Status | None) -> None:
-        """A new status. A learner that starts again from its checkpoint has fewer updates: that takes nothing away."""
+    def update(self, status: m.Status | None) -> None:
+        """Add a status. Fewer updates, of a learner that restarts from its checkpoint, do not reduce the growth."""
         if status is not None and self.last is not None:
             self.ticks += max(0, status.ticks - self.last.ticks)
             self.updates += max(0, status.updates - self.last.updates)
@@ -31,98 +31,100 @@ class Growth:
 
 
 class FaultSchedule:
-    """`say` shows the progress, `diary` is the file in which everything is noted with its time.
+    """Holds the faults to inject, and counts what they did.
 
-    `until_loss`: it is over as soon as a loss was seen.
+    `show_progress` shows a line of progress. `history`: the file in which every event is logged with its time.
+    `until_loss`: the schedule is over as soon as a loss is found.
     """
 
     def __init__(
-        self, faults: Iterable[Fault], say: Callable[[str], None], diary: Path, *, until_loss: bool = False
+        self, faults: Iterable[Fault], show_progress: Callable[[str], None], history: Path, *, until_loss: bool = False
     ) -> None:
-        self._left, self.say, self._diary, self._until_loss = deque(faults), say, diary, until_loss
-        self.asked = sum(fault.kills for fault in self._left)
+        self._left, self._history, self._until_loss = deque(faults), history, until_loss
+        self.show_progress = show_progress
+        self.planned_kills = sum(fault.kills for fault in self._left)
         self.done: list[Fault] = []
         self.kills: Counter[str] = Counter()
-        self.backs: Counter[str] = Counter()
+        self.recovered: Counter[str] = Counter()
         self.recoveries: defaultdict[str, list[float]] = defaultdict(list)
         self.crashes: list[str] = []
         self.failures: list[str] = []
         self.snapshots: list[Snapshot] = []
-        self.lost: set[Number] = set()
+        self.lost: set[RecordId] = set()
         """Records of this mission that were acknowledged and did not survive a kill."""
-        self.cut_off = 0
+        self.bytes_cut = 0
         self.power_lost: float | None = None
-        """When the power went, until the mission goes on."""
+        """When the power was lost (s of the monotonic clock), until the mission is resumed."""
         self.growth = Growth()
-        self.went_on = False
+        self.resumed = False
         self._start = time.monotonic()
 
     @property
     def next(self) -> Fault | None:
-        """The next fault, None when the schedule is over."""
+        """The next fault, or None when the schedule is over."""
         return self._left[0] if self._left else None
 
     @property
     def last(self) -> Fault:
-        """The fault before."""
+        """The last fault injected."""
         return self.done[-1]
 
-    def started(self) -> None:
-        """The next fault falls now."""
+    def start_next(self) -> None:
+        """Note that the next fault is injected now."""
         self.done.append(fault := self._left.popleft())
-        self.write(f"{fault.kind} {' '.join(fault.targets)} ({fault.seconds:.2f} s)")
+        self.log(f"{fault.kind} {' '.join(fault.targets)} ({fault.seconds:.2f} s)")
 
-    def later(self, fault: Fault) -> None:
-        """What is left of a fault to which a mission's end came first, for the next mission."""
+    def postpone(self, fault: Fault) -> None:
+        """Keep the rest of a fault for the next mission, because this mission ended first."""
         if fault.targets:
             self._left.appendleft(fault)
 
     def count(self, kind: str) -> int:
-        """Blows of a kind so far."""
+        """Return the number of faults of a kind so far."""
         return sum(fault.kind == kind for fault in self.done)
 
-    def back(self, who: str, seconds: float | None) -> None:
-        """A process that was killed is back and works, so long after; None where that could not be measured."""
-        self.backs[who] += 1
+    def note_recovery(self, role: str, seconds: float | None) -> None:
+        """Note that a killed process works again, `seconds` after the kill; None if that could not be measured."""
+        self.recovered[role] += 1
         if seconds is not None:
-            self.recoveries[who].append(seconds)
-            self.write(f"{who} is back after {seconds:.2f} s")
+            self.recoveries[role].append(seconds)
+            self.log(f"{role} recovered after {seconds:.2f} s")
 
     def power_restored(self, *, measured: bool) -> None:
-        """If the power was gone: the mission goes on, or has come to its end."""
+        """Note, if the power was lost, that the mission is resumed or has ended."""
         if self.power_lost is not None:
-            self.back(POWER, time.monotonic() - self.power_lost if measured else None)
+            self.note_recovery(POWER, time.monotonic() - self.power_lost if measured else None)
             self.power_lost = None
 
     def check_snapshots(self) -> None:
-        """Look for losses in the journals that kills have left."""
+        """Find the losses in the journals that kills have left."""
         while self.snapshots:
             lost = self.snapshots.pop().lost()
             self.lost |= lost
             if lost:
                 self._left = deque() if self._until_loss else self._left
-                self.write(f"{len(lost)} acknowledged records did not survive: {sorted(lost)[:10]}")
+                self.log(f"{len(lost)} acknowledged records did not survive: {sorted(lost)[:10]}")
 
     def finish(self, seconds: float) -> None:
-        """The schedule is over, and the mission goes on."""
-        self.went_on = True
-        self.write(f"the mission goes on after the last fault, seen after {seconds:.2f} s")
+        """Note that the mission flies on after the last fault."""
+        self.resumed = True
+        self.log(f"the mission flies on after the last fault, for {seconds:.2f} s")
 
-    def note(self, text: str) -> None:
-        """What the supervisor says: a process that failed by itself is remembered."""
-        if "with exit code" in text or "did not leave" in text:
+    def on_supervisor_note(self, text: str) -> None:
+        """Log a note of the supervisor; keep it if a process failed without a fault."""
+        if "with exit code" in text or "did not end" in text:
             self.crashes.append(text)
-        self.write(text)
+        self.log(text)
 
-    def write(self, text: str) -> None:
-        """A line of the diary."""
-        with self._diary.open("a", encoding="utf-8") as file:
+    def log(self, text: str) -> None:
+        """Write a line to the history."""
+        with self._history.open("a", encoding="utf-8") as file:
             file.write(f"{time.monotonic() - self._start:8.2f} {text}\n")
 
     def show(self) -> None:
-        """Progress."""
+        """Show the progress."""
         killed, spent = sum(self.kills.values()), time.monotonic() - self._start
         status = self.growth.last
         where = f" · episode {status.episode} tick {status.tick} · {status.updates:,} updates" if status else ""
-        left = f" · {clock(spent / killed * (self.asked - killed))} left" if killed else ""
-        self.say(f"kill {killed} of {self.asked}{where}{left}")
+        left = f" · {clock(spent / killed * (self.planned_kills - killed))} left" if killed else ""
+        self.show_progress(f"kill {killed} of {self.planned_kills}{where}{left}")

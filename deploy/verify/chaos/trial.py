@@ -1,4 +1,4 @@
-"""The whole trial: missions under a schedule, one after the other until it is over, and the result."""
+"""The whole trial: missions under a schedule of faults, one after the other until it is over, and the result."""
 
 from __future__ import annotations
 
@@ -8,84 +8,85 @@ from typing import Any
 
 from deploy.run.mission import bound_of, check, command_line, interrupted
 from deploy.verify.chaos.checker import DeliveryReport, check_delivery
-from deploy.verify.chaos.mission import Disturbed
+from deploy.verify.chaos.mission import ChaosMission
 from deploy.verify.chaos.schedule import FaultSchedule
-from deploy.verify.exactness import Quiet, fly
+from deploy.verify.exactness import NotesOnly, fly
 from tmc.analysis.invariants.check import check as check_log
 from tmc.kernel.config import Config, build
 from tmc.kernel.world import World
-from tmc.record import facts
-from tmc.record.reader import read, run_files
+from tmc.record import queries
+from tmc.record.reader import read
+from tmc.record.run_folder import run_files
 from tmc.wire import process
 
 TRAIN: dict[str, Any] = {
     "team.size": 3, "trial.ack_log": True, "training.episodes": 1_000_000, "training.checkpoint_every": 200,
 }  # fmt: skip
-"""A training that does not end by itself, whose learner loses little with each kill."""
+"""A training without an end, whose learner loses few updates with each kill."""
 FLY: dict[str, Any] = {
     "team.size": 3, "trial.ack_log": True, "training.episodes": 4, "trial.stall": 0.003, "trial.stall_share": 1.0,
 }  # fmt: skip
-"""Missions that take some ten seconds undisturbed."""
-UNDISTURBED: dict[str, Any] = {"trial.ack_log": False, "trial.ack_early": False, "trial.stall": 0.0}
+"""Missions that take about ten seconds without faults."""
+WITHOUT_FAULTS: dict[str, Any] = {"trial.ack_log": False, "trial.ack_early": False, "trial.stall": 0.0}
 """The same mission in lock step, for comparison."""
 
 
-class SilentProgress(Quiet):
-    """Shows nothing; notes go to the diary."""
+class SilentProgress(NotesOnly):
+    """Shows nothing; writes notes to the history."""
 
     schedule: FaultSchedule
 
     def work(self, what: str, share: float) -> None: ...
 
     def note(self, text: str) -> None:
-        self.schedule.write(text)
+        self.schedule.log(text)
         self.schedule.failures.append(text)
 
 
 @dataclass
 class TrialResult:
-    """What came of the trial; `faults`: sentences, none when all is well."""
+    """The result of a trial. `violations`: one sentence for each; none if the trial passed."""
 
     schedule: FaultSchedule
     missions: int = 0
-    exact: list[DeliveryReport] = field(default_factory=list)
+    deliveries: list[DeliveryReport] = field(default_factory=list)
     facts: int = 0
     """Facts that `log check` compared."""
-    faults: list[str] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
 
-    def sum(self, what: str) -> int:
-        """Of all missions, one of the counts of DeliveryReport."""
-        return sum(getattr(exact, what) for exact in self.exact)
+    def total(self, count: str) -> int:
+        """Return a count of DeliveryReport, summed over all missions."""
+        return sum(getattr(delivery, count) for delivery in self.deliveries)
 
 
 def run(config: Config, policy: bytes | None, place: Path, schedule: FaultSchedule, *, trains: bool) -> TrialResult:
-    """One training, or mission after mission until the schedule is over; their folders are in `place`.
+    """Run one training, or mission after mission until the schedule is over; their folders are in `place`.
 
     Raises KeyboardInterrupt when the user stops it.
     """
     result = TrialResult(schedule)
-    while schedule.next is not None and not result.faults:
+    while schedule.next is not None and not result.violations:
         seed = config.training.seed + result.missions
         world = check(build({"training.seed": seed}, config), policy)
         result.missions += 1
         out = place / f"mission-{result.missions}"
-        code = _disturb(world, policy, out, schedule, lasts=not trains)
+        code = _fly_under_faults(world, policy, out, schedule, lasts=not trains)
         if code not in (process.DONE, process.FAILED):
             raise KeyboardInterrupt
-        result.faults += schedule.failures
+        result.violations += schedule.failures
         _check(result, out)
         if not trains and code == process.DONE:
             _compare(result, world, policy, out)
-    _sum_up(result, trains=trains)
+    _check_totals(result, trains=trains)
     return result
 
 
-def _disturb(world: World, policy: bytes | None, out: Path, schedule: FaultSchedule, *, lasts: bool) -> int:
-    """One mission, taken up again after each power cut; returns its exit code."""
+def _fly_under_faults(world: World, policy: bytes | None, out: Path, schedule: FaultSchedule, *, lasts: bool) -> int:
+    """Fly one mission under faults, resumed after each power cut; return its exit code."""
     out.mkdir()
     while True:
         progress = SilentProgress(world.config, world.law.cells.size, bound_of(world))
-        mission = Disturbed(world, out, command_line(), policy, progress)
+        mission = ChaosMission(world, out, command_line(), policy, progress)
         progress.schedule = mission.schedule = schedule
         mission.lasts = lasts
         code = mission.run(in_one_process=False)
@@ -95,46 +96,48 @@ def _disturb(world: World, policy: bytes | None, out: Path, schedule: FaultSched
 
 
 def _check(result: TrialResult, out: Path) -> None:
-    """Records and invariants of a mission."""
+    """Check the records and the invariants of a mission."""
     schedule = result.schedule
-    result.exact.append(check_delivery(out, schedule.lost))
+    result.deliveries.append(check_delivery(out, schedule.lost))
     schedule.lost.clear()
-    checked = check_log(out, lambda what, _share: schedule.say(f"{out.name}: {what}"))
+    checked = check_log(out, lambda what, _share: schedule.show_progress(f"{out.name}: {what}"))
     result.facts += sum(row.facts for row in checked.rows)
-    result.faults += [f"log check: {row.name}: {row.violation}" for row in checked.rows if row.violation is not None]
+    result.violations += [
+        f"log check: {row.name}: {row.violation}" for row in checked.rows if row.violation is not None
+    ]
 
 
 def _compare(result: TrialResult, world: World, policy: bytes | None, out: Path) -> None:
-    """Hold a mission against the same in lock step: every cell, and the maps and the replay memory of each episode."""
-    calm = out.with_name(f"{out.name}-lockstep")
-    fly(check(build(UNDISTURBED, world.config), policy), policy, calm, in_one_process=True)
-    if facts.digest(out) != facts.digest(calm):
-        result.faults.append(f"{out.name} flew other cells than the same mission in lock step")
+    """Compare a mission with the same in lock step: every cell, and maps and replay memory after each episode."""
+    reference = out.with_name(f"{out.name}-lockstep")
+    fly(check(build(WITHOUT_FAULTS, world.config), policy), policy, reference, in_one_process=True)
+    if queries.digest(out) != queries.digest(reference):
+        result.violations.append(f"{out.name} flew other cells than the same mission in lock step")
     states = _states(out)
-    for episode, state in _states(calm).items():
+    for episode, state in _states(reference).items():
         if states.get(episode) != state:
-            result.faults.append(
+            result.violations.append(
                 f"after episode {episode} of {out.name}, maps or replay memory are not as in lock step"
             )
             return
 
 
 def _states(out: Path) -> dict[int, tuple[str, str, int]]:
-    """By episode: digests of the maps and of the replay memory, and how many transitions it holds."""
+    """Return, by episode, the digests of the maps and of the replay memory, and its number of transitions."""
     found = (entry.message for entry in read(run_files(out)["tmc"], {"/tmc/state"}))
     return {m.episode: (m.map, m.replay, m.transitions) for m in found}
 
 
-def _sum_up(result: TrialResult, *, trains: bool) -> None:
-    """What is to be said of all missions together."""
-    schedule, lost, doubled = result.schedule, result.sum("lost"), result.sum("doubled")
+def _check_totals(result: TrialResult, *, trains: bool) -> None:
+    """Check the totals of all missions; put their violations first."""
+    schedule, lost, doubled = result.schedule, result.total("lost"), result.total("doubled")
     crash = next(iter(schedule.crashes), "")
-    kills, backs = sum(schedule.kills.values()), sum(schedule.backs.values())
+    kills, recovered = sum(schedule.kills.values()), sum(schedule.recovered.values())
     sentences = {
         f"{lost:,} records were acknowledged and are lost": lost,
         f"{doubled:,} records were applied twice": doubled,
-        f"{kills - backs} of {kills} processes that were killed did not come back": kills - backs,
-        f"{len(schedule.crashes)} processes ended by themselves, first: {crash}": schedule.crashes,
-        "the training did not go on after the last kill": trains and not schedule.went_on,
+        f"{kills - recovered} of {kills} killed processes did not recover": kills - recovered,
+        f"{len(schedule.crashes)} processes failed without a fault, first: {crash}": schedule.crashes,
+        "the training did not resume after the last kill": trains and not schedule.resumed,
     }
-    result.faults = [sentence for sentence, so in sentences.items() if so] + result.faults
+    result.violations = [sentence for sentence, violated in sentences.items() if violated] + result.violations

@@ -29,12 +29,12 @@ MACHINE = {"platform", "processor", "cores", "load", "python", "numpy", "torch",
 
 
 def changes(*settings: str) -> list[str]:
-    """Options that set these."""
+    """Return the options that change these settings."""
     return [word for setting in settings for word in ("--set", setting)]
 
 
 def rows_of(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
-    """What a bench prints, by case and what the reference is: strict JSON, each row with the machine beside it."""
+    """Run a bench; return its rows by case and reference. Its output is strict JSON, each row with the machine."""
 
     def refuse(word: str) -> None:
         raise AssertionError(f"{word} is not JSON")
@@ -49,27 +49,27 @@ def rows_of(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]
 
 
 def units(rows: dict[str, Any]) -> dict[str, str]:
-    """The unit of each row."""
+    """Return the unit of each row."""
     return {case: row["unit"] for case, row in rows.items()}
 
 
 def is_in_proportion(row: dict[str, Any]) -> bool:
-    """Whether the ratio of one turn is the value over its reference; a flight too short to be timed has neither."""
+    """Return whether the ratio of one turn is value / reference; a flight too short to be timed has neither."""
     if row["value"] is None:
         return row["ratio"] is None
     return bool(row["ratio"] == pytest.approx(row["value"] / row["reference"]))
 
 
-def test_rollout_prints_a_line_of_json_a_figure(capsys: pytest.CaptureFixture[str]) -> None:
+def test_rollout_prints_a_line_of_json_per_figure(capsys: pytest.CaptureFixture[str]) -> None:
     rows = rows_of(capsys, *TINY[1:], "--transport", "both")
     expected = {}
     for n in (1, 2):
         expected[f"N={n} one process"] = "UAV steps/s"
         for name in (f"N={n} table", f"N={n} beacons"):
             expected |= {f"{name} x one process": "UAV steps/s", f"{name} waits": "share of time"}
-            expected |= {f"{name} beacons": "beacons/step", f"{name} private of the limit": "MiB, largest UAV"}
+            expected |= {f"{name} beacons": "beacons/UAV step", f"{name} private of the limit": "MiB, largest UAV"}
             expected |= {
-                f"{name} memory of the limit": "MiB in all",
+                f"{name} memory of the limit": "MiB in total",
                 f"{name} start of the limit": "s to the first tick",
             }
             assert is_in_proportion(rows[f"{name} x one process"]) and is_in_proportion(
@@ -81,11 +81,11 @@ def test_rollout_prints_a_line_of_json_a_figure(capsys: pytest.CaptureFixture[st
     beacons = {
         name: rows[f"{name} beacons"]["value"] for name in ("N=1 table", "N=1 beacons", "N=2 table", "N=2 beacons")
     }
-    told = beacons.pop("N=2 beacons")
-    assert told and not any(beacons.values()), "beacons are for two, and not for those who share a table"
+    sent = beacons.pop("N=2 beacons")
+    assert sent and not any(beacons.values()), "beacons are for two UAVs, and not for those that share a table"
 
 
-def test_journal_prints_a_line_of_json_a_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_journal_prints_a_line_of_json_per_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tiny = ["--actors", "2", "--ticks", "100", "--repeats", "1", "--seconds", "0.3", "--dir", str(tmp_path)]
     rows = rows_of(capsys, "journal", *tiny, "--pace", "500")
     once = {"fsync": "ms, median", "log check of 200 UAV steps": "s"}
@@ -100,11 +100,11 @@ def test_journal_prints_a_line_of_json_a_figure(tmp_path: Path, capsys: pytest.C
     assert rows[compacted[1]]["value"] < rows[compacted[0]]["value"], "a part has more bytes than the whole"
     assert list(tmp_path.iterdir()) == []
     assert cli.main(["bench", "journal", "--dir", str(tmp_path / "gone")]) == 2
-    assert "is no folder: choose one" in capsys.readouterr().err
+    assert "is not a folder: choose one" in capsys.readouterr().err
 
 
 class FakeTime:
-    """A clock that only sleep moves on, by a microsecond at least."""
+    """A clock that only sleep advances, by a microsecond at least."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -118,8 +118,8 @@ class FakeTime:
         self.now += max(seconds, 1e-6)
 
 
-def test_records_a_second_are_those_of_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An outbox of 3 records takes 0.1 s: 30 records a second at full speed, and what is asked for if that is less."""
+def test_records_per_second_are_those_of_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An outbox of 3 records takes 0.1 s: 30 records per second at full speed, or the pace if that is less."""
     clock, world = FakeTime(), World(build({"team.size": 2, "training.ticks": 10}))
     monkeypatch.setattr(journal, "time", clock)
     monkeypatch.setattr(Journal, "take", lambda self, outbox: clock.sleep(0.1))
@@ -133,12 +133,12 @@ def test_records_a_second_are_those_of_the_clock(tmp_path: Path, monkeypatch: py
 def test_replay_weighs_and_draws(capsys: pytest.CaptureFixture[str]) -> None:
     rows = rows_of(capsys, "replay", "--minibatches", "3", *changes("replay.capacity=9000", "dqn.batch_size=16"))
     cases = ("9,000 transitions", "9,000 transitions with priorities", "process above an empty one",
-             "a minibatch of 16", "the fastest of them", "prioritised, and its update", "inserts")  # fmt: skip
-    plain, prioritised, _, median, fastest, *_ = found = [rows[f"{case} of what is asked"] for case in cases]
+             "minibatch of 16", "minibatch of 16, fastest", "prioritised, with update", "inserts")  # fmt: skip
+    plain, prioritised, _, median, fastest, *_ = found = [rows[f"{case} of the limit"] for case in cases]
     assert len(rows) == len(found)
-    assert [row["unit"] for row in found] == ["bytes each"] * 2 + ["MB"] + ["ms"] * 3 + ["transitions/s"]
+    assert [row["unit"] for row in found] == ["bytes/transition"] * 2 + ["MB"] + ["ms"] * 3 + ["transitions/s"]
     assert all(is_in_proportion(row) for row in found if row["value"] is not None)
-    # What a transition weighs follows from the types that it is kept in, so it is the same everywhere.
+    # The size of a transition follows from the types of its fields, so it is the same everywhere.
     assert 40 < plain["value"] < 50 and 8 <= prioritised["value"] - plain["value"] < 9
     assert fastest["value"] <= median["value"]
 
@@ -154,22 +154,22 @@ def test_a_memory_of_twice_the_transitions_weighs_as_much_each() -> None:
     assert each(12_000) == pytest.approx(each(6_000), rel=0.05)
 
 
-def test_actor_holds_a_step_against_its_network(capsys: pytest.CaptureFixture[str]) -> None:
+def test_actor_compares_a_step_with_its_network(capsys: pytest.CaptureFixture[str]) -> None:
     rows = rows_of(capsys, "actor", "--repeats", "1", "--ticks", "60", "--actors", "2")
-    step, rate = rows["N=2 a whole step the call of ONNX Runtime / step"], rows["N=2 steps x bare calls/s, aim 0.4"]
+    step, rate = rows["N=2 whole step ONNX Runtime call / step"], rows["N=2 steps x textbook calls/s, aim 0.4"]
     assert len(rows) == 2 and (step["unit"], rate["unit"]) == ("us", "UAV steps/s")
     assert step["value"] * rate["value"] == pytest.approx(1e6) == step["reference"] * rate["reference"]
     assert step["ratio"] == pytest.approx(step["reference"] / step["value"]) == rate["ratio"]
 
 
-CPU = {f"N=2 threads=1 {role}": "ms of CPU an update" for role in ("learner", "tmc", "uavs")}
+CPU = {f"N=2 threads=1 {role}": "ms of processor time per update" for role in ("learner", "tmc", "uavs")}
 
 
-def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str]) -> None:
+def test_learner_is_compared_with_the_textbook_loop(capsys: pytest.CaptureFixture[str]) -> None:
     """A small mission in real processes, and the learner's gradients: exact within what float32 can round.
 
     How far that is follows from float32's eps, the numbers of terms and the sizes of the numbers (`learner.rounding`),
-    so it holds on every processor. What rounding really does is no law, and is printed, not asserted.
+    so it holds on every processor. The real rounding error depends on the processor: it is printed, not asserted.
     """
     turns = ["--repeats", "1", "--seconds", "0.3", "--threads", "1", "--steps", "40"]
     rows = rows_of(capsys, "learner", *turns, "--actors", "2", "--ticks", "200", *changes(*SMALL))
@@ -185,14 +185,14 @@ def test_learner_is_held_against_the_bare_loop(capsys: pytest.CaptureFixture[str
 
 
 def compared(**changes: Any) -> tuple[Row, Row]:
-    """The rows of the comparison alone, for a small mission."""
+    """Return only the rows of the comparison, for a small mission."""
     small = {"replay.capacity": 200, "dqn.target_updates": 10, "dqn.batch_size": 16, "network.channels": (4, 4)}
     departure, worst = learner.compare(World(build({**learner.MISSION, **small, "team.size": 2, **changes})), 40)
     return departure, worst
 
 
 def test_a_wrong_learner_shows_in_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A value that is kept when theta- has followed is outside the bound, and far more than rounding."""
+    """A target value that is kept after theta- has changed is outside the bound, and far more than rounding."""
     _, worst = compared()
     assert worst.value is not None and worst.value <= 1
     monkeypatch.setattr(TargetValueCache, "forget", lambda self: None)
@@ -223,7 +223,7 @@ def flown(rate: float, idle: float | None, **cpu: float) -> learner.Learned:
 def test_figures_of_several_turns_are_medians_and_ratios_are_taken_in_pairs() -> None:
     runs = [flown(60, 0.2, learner=10, tmc=2), flown(90, None, learner=20, tmc=1), flown(80, 0.4, learner=30, tmc=3)]
     config = build({"team.size": 3, "training.threads": 2})
-    plain, tuned, *rest = learner._rows(config, runs, bare=[40, 90, 20], tuned=[60, 60, 60])
+    plain, tuned, *rest = learner._rows(config, runs, textbook=[40, 90, 20], tuned=[60, 60, 60])
     assert (plain.value, plain.reference, plain.ratio) == (80, 40, 1.5)  # of 1.5, 1 and 4; not 80 / 40
     assert (tuned.value, tuned.reference, tuned.ratio) == (80, 60, 80 / 60)
     assert [(row.case.split()[-1], row.value) for row in rest] == [
@@ -231,7 +231,7 @@ def test_figures_of_several_turns_are_medians_and_ratios_are_taken_in_pairs() ->
         ("learner", 20),
         ("tmc", 2),
     ]
-    ticks, *_, start, memory = train._rows(3, runs, bare=[40, 90, 20])
+    ticks, *_, start, memory = train._rows(3, runs, textbook=[40, 90, 20])
     assert (ticks.value, ticks.reference, ticks.ratio) == (40, 40, 0.75)
     assert (start.value, memory.value) == (1, 100)
 
@@ -243,9 +243,9 @@ def test_train_counts_the_ticks_of_the_whole_recipe(capsys: pytest.CaptureFixtur
     assert units(rows) == {
         "N=2 x textbook loop": "ticks/s",
         "N=2 idle": "share of time",
-        **dict.fromkeys(("N=2 learner", "N=2 tmc", "N=2 uavs"), "ms of CPU an update"),
+        **dict.fromkeys(("N=2 learner", "N=2 tmc", "N=2 uavs"), "ms of processor time per update"),
         "N=2 start": "s to the first update",
-        "N=2 memory": "MiB in all",
+        "N=2 memory": "MiB in total",
     }
 
 
@@ -253,24 +253,26 @@ def test_startup_says_how_long_a_user_waits(capsys: pytest.CaptureFixture[str]) 
     rows = rows_of(
         capsys, "startup", "--repeats", "1", "--warm", "0", "--actors", "1", *changes("network.channels=4,4")
     )
-    asked = {f"{case} of what is asked": limit for case, limit in (("run quick, N=1", "run"), ("actor alone", "actor"))}
+    limits = {f"{case} of the limit": limit for case, limit in (("run quick, N=1", "run"), ("actor alone", "actor"))}
     parts = [f"{case} x an empty Python" for case in ("--help", *(f"import {role}" for role in startup.ROLES))]
-    assert set(rows) == {*asked, *parts} and all(is_in_proportion(row) for row in rows.values())
-    assert {name: rows[name]["reference"] for name in asked} == {name: startup.LIMITS[of] for name, of in asked.items()}
+    assert set(rows) == {*limits, *parts} and all(is_in_proportion(row) for row in rows.values())
+    assert {name: rows[name]["reference"] for name in limits} == {
+        name: startup.LIMITS[of] for name, of in limits.items()
+    }
     assert len({rows[name]["reference"] for name in parts}) == 1, "each beside the same empty Python"
 
 
-def test_memory_is_told_by_role(capsys: pytest.CaptureFixture[str]) -> None:
+def test_memory_is_given_by_role(capsys: pytest.CaptureFixture[str]) -> None:
     small = ("replay.capacity=300", "dqn.batch_size=16", "network.channels=4,4", "replay.learn_start=40")
     rows = rows_of(capsys, "memory", "--transitions", "100", "--actors", "2", "--ticks", "100", *changes(*small))
-    whole, roles = rows["N=2 of what is asked"], [row for case, row in rows.items() if case.endswith("of all")]
+    whole, roles = rows["N=2 of the limit"], [row for case, row in rows.items() if case.endswith("of the total")]
     if whole["value"] is None:
         pytest.skip("this system does not tell the memory of a process")
-    assert whole["reference"] == memory.LIMIT and is_in_proportion(whole)
+    assert whole["reference"] == memory.LIMIT_MB and is_in_proportion(whole)
     assert {f"N=2 {role}" for role in ("learner", "supervisor", "tmc", "uavs")} <= {row["case"] for row in roles}
     assert sum(row["value"] for row in roles) == pytest.approx(whole["value"])
     assert sum(row["ratio"] for row in roles) == pytest.approx(1)
-    assert rows["replay, 300 transitions of what is asked"]["unit"] == "MB"
+    assert rows["replay, 300 transitions of the limit"]["unit"] == "MB"
 
 
 @pytest.mark.parametrize(
@@ -307,7 +309,7 @@ def test_memory_is_what_the_system_says() -> None:
 
 
 class Counting:
-    """The clock of a process in which a look at it takes a hundredth of a second, and all the rest takes none."""
+    """The clock of a process in which reading it takes 0.01 s, and everything else takes no time."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -324,15 +326,15 @@ class Counting:
 def test_a_core_counts_as_much_alone_as_together(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With a clock that nobody else can slow down both are the same; and who comes too late does not count."""
+    """With a clock that no other process can slow down both are equal. A process that is late does not count."""
     monkeypatch.setattr(cores, "time", Counting())
     assert cores.main(["101", "1"]) == 0
     alone, together = json.loads(capsys.readouterr().out)
-    assert alone == pytest.approx(100 * cores.SECONDS, abs=2) and together == pytest.approx(alone, abs=2)
+    assert alone == pytest.approx(100 * cores.COUNT_S, abs=2) and together == pytest.approx(alone, abs=2)
     assert cores.main(["103", "0"]) == 0
-    assert json.loads(capsys.readouterr().out) == [0, pytest.approx(100 * cores.SECONDS, abs=2)]
+    assert json.loads(capsys.readouterr().out) == [0, pytest.approx(100 * cores.COUNT_S, abs=2)]
     assert cores.main(["100", "1"]) == 0
-    assert capsys.readouterr().out == "null\n", "it came too late, and counted all the same"
+    assert capsys.readouterr().out == "null\n", "it started too late, and counted nevertheless"
 
 
 @pytest.mark.parametrize(
@@ -341,7 +343,7 @@ def test_a_core_counts_as_much_alone_as_together(
 def test_what_the_cores_are_worth_is_all_at_once_over_one_alone(
     counts: list[str], worth: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What each process of the bench prints, the first of which counts alone before; null: it came too late."""
+    """`counts`: what the processes print, the first of which counts alone first; null: it started too late."""
     monkeypatch.setattr(cores.helper, "start", lambda _module, _start, first, **_: first)
     monkeypatch.setattr(cores.helper, "output_of", lambda first: counts[0 if first else 1])
     monkeypatch.setattr(cores, "core_count", lambda: 2)

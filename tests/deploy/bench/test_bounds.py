@@ -65,7 +65,7 @@ def test_a_pace_that_would_take_days_is_said_once_it_is_known() -> None:
     pace.check(0, now=5.0)
     pace.check(100, now=14.0)  # too early to tell
     with pytest.raises(
-        ConfigError, match=r"^--transitions 1,000,000,000 would take 3 years at the pace here, 10 a second"
+        ConfigError, match=r"^--transitions 1,000,000,000 would take 3 years at the pace here, 10 per second"
     ):
         pace.check(100, now=15.0)
     pace = bounds.Pace("--transitions", 10**6)

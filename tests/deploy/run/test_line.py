@@ -1,4 +1,4 @@
-"""The line of progress: as wide as the terminal is now, whole elsewhere, and never the reason that work fails."""
+"""The line of progress: cut to the terminal's current width, whole elsewhere; it never makes work fail."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def no_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def terminal() -> Iterator[Open]:
-    """Opens a terminal of so many columns; returns its two sides."""
+    """Return a function that opens a terminal of a number of columns and returns its two sides."""
     opened: list[tuple[TextIO, int]] = []
 
     def make(columns: int) -> tuple[TextIO, int]:
@@ -55,7 +55,7 @@ def resize(ours: int, columns: int) -> None:
 
 
 def sent(out: TextIO, ours: int) -> str:
-    """All that a terminal was sent."""
+    """Return all that was written to a terminal."""
     out.write(END)
     out.flush()
     data = b""
@@ -65,20 +65,20 @@ def sent(out: TextIO, ours: int) -> str:
 
 
 def shown(out: TextIO, ours: int) -> str:
-    """What a terminal was sent, without what places the cursor."""
+    """Return what was written to a terminal, without cursor movements."""
     return sent(out, ours).replace("\r", "").rstrip(" ")
 
 
 @pytest.mark.parametrize("columns", [40, 80, 100, 250])
 def test_a_line_is_cut_where_the_terminal_ends(terminal: Open, columns: int) -> None:
     out, ours = terminal(columns)
-    Line(out).say(LONG)
+    Line(out).show(LONG)
     assert shown(out, ours) == LONG[: columns - 1].rstrip(" ")
 
 
 def test_a_terminal_whose_width_is_not_known_cuts_nothing(terminal: Open) -> None:
     out, ours = terminal(0)
-    Line(out).say(LONG)
+    Line(out).show(LONG)
     assert shown(out, ours) == LONG.rstrip(" ")
 
 
@@ -86,31 +86,31 @@ def test_the_width_that_the_user_chose_counts(terminal: Open, monkeypatch: pytes
     out, ours = terminal(80)
     for chosen, width in (("120", 120), ("0", 80), ("wide", 80), ("-5", 80), ("", 80)):
         monkeypatch.setenv("COLUMNS", chosen)
-        Line(out).say(LONG)
+        Line(out).show(LONG)
         assert shown(out, ours) == LONG[: width - 1].rstrip(" ")
 
 
 def test_a_terminal_that_is_resized_is_followed(terminal: Open) -> None:
-    """Nothing is written beyond the end of one that became narrower, where it would begin another line."""
+    """Nothing is written beyond the width of a terminal that became narrower, which would start another line."""
     out, ours = terminal(120)
-    told = Line(out)
-    told.say(LONG)
+    line = Line(out)
+    line.show(LONG)
     assert len(shown(out, ours)) == len(LONG[:119].rstrip(" "))
     resize(ours, 50)
-    told.say("short")
+    line.show("short")
     assert len(sent(out, ours).lstrip("\r")) <= 49
     resize(ours, 200)
-    told.say(LONG)
+    line.show(LONG)
     assert len(shown(out, ours)) == len(LONG[:199].rstrip(" "))
 
 
 def test_a_shorter_line_leaves_nothing_of_a_longer_one(terminal: Open) -> None:
     out, ours = terminal(80)
-    told = Line(out)
-    told.say("a longer line")
-    told.say("short")
-    told.clear()
-    told.keep("stays")
+    line = Line(out)
+    line.show("a longer line")
+    line.show("short")
+    line.clear()
+    line.print("stays")
     assert sent(out, ours) == (
         "\ra longer line" + "\rshort        " + "\r     \r" + "stays\r\n"
     )  # fmt: skip
@@ -118,7 +118,7 @@ def test_a_shorter_line_leaves_nothing_of_a_longer_one(terminal: Open) -> None:
 
 def test_elsewhere_lines_are_whole() -> None:
     out = io.StringIO()
-    Line(out).say(LONG)
+    Line(out).show(LONG)
     assert out.getvalue() == LONG + "\n"
 
 
@@ -131,20 +131,20 @@ def test_what_matters_least_is_left_out_first() -> None:
     assert fit(parts, 4) == "tick"
 
 
-def test_a_narrow_terminal_still_shows_the_tick_and_who_is_waited_for(terminal: Open) -> None:
+def test_a_narrow_terminal_still_shows_the_tick_and_what_is_waited_for(terminal: Open) -> None:
     out, ours = terminal(40)
     progress = Progress(build({"training.episodes": 12}), 323, 0.0, out)
     status = Status("flying", 3, 410, 2410, 100, 1, 0.1, 150.0, 160.0, 7, 0, "uav-001")
-    progress._past = [(-10.0, 2410, 100)]
+    progress._recent = [(-10.0, 2410, 100)]
     progress.show(status)
     assert shown(out, ours) == "tick 2,410/12,000 · waiting for uav-001"
 
 
 def test_what_others_are_called_cannot_move_the_cursor() -> None:
     out = io.StringIO()
-    told = Line(out)
-    told.say("waiting for \x1b[2J\r\nmap")
-    told.keep("cannot read map \x1b[31m\udcff")
+    line = Line(out)
+    line.show("waiting for \x1b[2J\r\nmap")
+    line.print("cannot read map \x1b[31m\udcff")
     assert out.getvalue() == "waiting for \\x1b[2J\\r\\nmap\ncannot read map \\x1b[31m\\xff\n"
 
 
@@ -160,38 +160,38 @@ class Full(io.StringIO):
 
 
 @pytest.mark.parametrize("out", [closed, Full])
-def test_what_cannot_be_written_is_not_told(out: Callable[[], TextIO]) -> None:
-    told = Line(out())
+def test_what_cannot_be_written_is_dropped(out: Callable[[], TextIO]) -> None:
+    line = Line(out())
     for _ in range(3):
-        told.say("waiting")
-        told.share("sealing", 0.5)
-        told.keep("stopped")
-        told.clear()
+        line.show("waiting")
+        line.share("sealing", 0.5)
+        line.print("stopped")
+        line.clear()
 
 
 def test_a_terminal_that_is_gone_does_not_matter() -> None:
     ours, its = pty.openpty()
     out = os.fdopen(its, "w")
-    told = Line(out)
+    line = Line(out)
     os.close(ours)
-    told.say("waiting")
-    told.keep("stopped")
+    line.show("waiting")
+    line.print("stopped")
     with suppress(OSError):
         out.close()
 
 
 def test_a_process_without_stderr_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stderr", None)
-    told = Line()
-    told.say("waiting")
-    told.keep("stopped")
+    line = Line()
+    line.show("waiting")
+    line.print("stopped")
 
 
 def test_what_takes_long_says_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     now, out = [0.0], io.StringIO()
     monkeypatch.setattr(line.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(line, "PLAIN_EVERY_S", 5.0)
-    told = Line(out, delay=2.0)
+    shown = Line(out, delay=2.0)
     for now[0] in (1.0, 1.9, 2.5, 3.0, 8.0):
-        told.share("reading tmc.mcap", now[0] / 10)
+        shown.share("reading tmc.mcap", now[0] / 10)
     assert out.getvalue().splitlines() == ["reading tmc.mcap: 25%", "reading tmc.mcap: 80%"]

@@ -1,4 +1,4 @@
-"""Limits of the system: raised where they may be, and else named before any process starts."""
+"""Limits of the system are raised where possible, and otherwise named before any process starts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TEAM = build({"team.size": 30, "team.controller": "planner:greedy"})
 
 
 def limited(limit: str, *words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """A command in a shell that has set a limit with `ulimit`."""
+    """Run a command in a shell that has set a limit with `ulimit`."""
     line = ["sh", "-c", f'ulimit {limit} && exec "$@"', "sh", *map(str, words)]
     return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
 
@@ -69,7 +69,7 @@ print(raised(kind, 80, 40), raised(kind, 80, 60), raised(kind, 200, 90), resourc
 
 
 def test_the_limits_of_a_container_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of its own group and of those above it, in both versions of control groups."""
+    """Those of its own group and of the groups above it, in both versions of control groups."""
     for folder, name, value in (
         ("pids/pod/own", "pids.max", "max"), ("pids/pod", "pids.max", "200"), ("pids/pod", "pids.current", "150"),
         ("memory/pod/own", "memory.limit_in_bytes", str(50 * machine.MIB)),
@@ -105,7 +105,7 @@ def test_the_threads_that_a_user_has_already_count(tmp_path: Path, monkeypatch: 
     assert machine.ALLOWED[machine.THREADS](need, tmp_path) == 50
 
 
-def test_what_is_asked_of_memory_is_less_than_the_replay_memory_takes() -> None:
+def test_the_needed_memory_is_less_than_the_replay_memory_takes() -> None:
     """So a mission that could fly is not refused."""
     config = build({"team.size": 3, "replay.capacity": 30_000, "replay.learn_start": 128})
     world = World(config)
@@ -115,7 +115,7 @@ def test_what_is_asked_of_memory_is_less_than_the_replay_memory_takes() -> None:
 
 
 @pytest.mark.parametrize("period", [1, 500])
-def test_what_is_asked_of_the_disk_is_less_than_a_flight_leaves(period: int, tmp_path: Path) -> None:
+def test_the_needed_disk_space_is_less_than_a_flight_leaves(period: int, tmp_path: Path) -> None:
     values = {"team.controller": "planner:random-road", "team.size": 5, "training.ticks": 2000, "training.episodes": 1}
     config = build({**values, "comms.period": period, "journal.commit_interval": 5.0, "journal.flush_interval": 5.0})
     lockstep.run(World(config), tmp_path, None, Progress(config, 1, 0.0))
@@ -123,7 +123,7 @@ def test_what_is_asked_of_the_disk_is_less_than_a_flight_leaves(period: int, tmp
     assert need.amount <= (tmp_path / "tmc.mcap").stat().st_size
 
 
-def test_a_training_without_an_end_is_asked_for_a_day() -> None:
+def test_a_training_without_an_end_needs_the_space_of_a_day() -> None:
     endless, day = build({"training.episodes": 10_000_000}), build({"training.episodes": 10_000})
     assert [*machine.needs(endless, learns=True)] == [*machine.needs(day, learns=True)]
 

@@ -1,4 +1,4 @@
-"""The folder that processes share: in memory where there is room, elsewhere where there is not, or a sentence."""
+"""The scratch folder: in memory if there is room, elsewhere if there is not, or an error of one sentence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZE = tracks.table_bytes(3, 1000)
 
 @pytest.fixture
 def places(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Path, Path]]:
-    """Two folders with short paths, which stand for memory and for that of temporary files; no other is looked at."""
+    """Return two folders with short paths that replace the places for scratch folders."""
     with scratch.made(CONFIG) as shared:
         memory, temporary = shared.folder / "m", shared.folder / "t"
         memory.mkdir()
@@ -76,7 +76,7 @@ def test_a_path_that_is_too_long_for_a_socket_is_passed_over(
 
 
 def test_a_path_that_is_not_utf8_is_passed_over(places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    """It could not be told to the UAVs."""
+    """A message could not carry such a path to the UAVs."""
     odd = places[0] / os.fsdecode(b"\xff")
     try:
         odd.mkdir()
@@ -111,12 +111,12 @@ def test_a_system_that_reserves_no_room_gets_zeros(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(os, "posix_fallocate", unknown)
     tracks.create_table(tmp_path / "tracks", 200, 1000)
     content = (tmp_path / "tracks").read_bytes()
-    assert len(content) == tracks.table_bytes(200, 1000) > tracks._PIECE
+    assert len(content) == tracks.table_bytes(200, 1000) > tracks._CHUNK_BYTES
     assert not any(content)
 
 
-def test_room_is_asked_for_and_not_hoped_for(tmp_path: Path) -> None:
-    """A file that only has its size would be a SIGBUS later: with a limit on the size of files it is refused now."""
+def test_space_is_reserved_at_once(tmp_path: Path) -> None:
+    """A sparse file would cause SIGBUS later. With a limit on the size of files, the table is refused at once."""
     code = f"""
 import resource
 from pathlib import Path
@@ -143,7 +143,7 @@ TMPDIR=$PWD "$@" --out long
 
 
 def test_missions_fly_where_memory_is_small_unwritable_or_gone(tmp_path: Path) -> None:
-    """A container has 64 MB of /dev/shm, or whatever it was given."""
+    """A container has 64 MB of /dev/shm by default."""
     namespace = ["unshare", "--mount", "sh", "-c"]
     if (
         shutil.which("unshare") is None

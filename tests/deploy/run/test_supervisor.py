@@ -1,4 +1,4 @@
-"""The supervisor: who is started again, after how long, who is given up, and that nothing is left behind."""
+"""The supervisor: which processes are restarted, after how long, when it fails, and that nothing is left behind."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[3]
 
 
 def python(name: str, code: str, *, restart: bool = True, leads: bool = False) -> Child:
-    """A process of the plan that runs `code`."""
+    """Return a process of the plan that runs `code`."""
     return Child(name, (sys.executable, "-P", "-c", code), restart=restart, leads=leads)
 
 
@@ -34,20 +34,20 @@ NOWHERE = "tcp://127.0.0.1:1"
 
 
 def uav(number: int, out: Path) -> Child:
-    """A forked UAV that says hello to nobody, for ever."""
+    """Return a forked UAV that sends Hello for ever, without a TMC."""
     command = ("--id", str(number), "--connect", NOWHERE, "--out", str(out))
     return Child(f"uav-{number:03d}", command, restart=True, fork_of="actors")
 
 
 def learner(out: Path) -> Child:
-    """A forked learner that says hello to nobody, for ever."""
+    """Return a forked learner that sends Hello for ever, without a TMC."""
     command = ("--connect", NOWHERE, "--out", str(out))
     return Child("learner", command, restart=True, fork_of="learner")
 
 
 @pytest.fixture
 def supervise(tmp_path: Path) -> Iterator[Callable[..., Supervisor]]:
-    """A started supervisor of these children; its notes are in `.notes`."""
+    """Return a function that starts a supervisor of children; its notes are in `.notes`."""
     made: list[Supervisor] = []
 
     def start(*children: Child) -> Supervisor:
@@ -75,14 +75,14 @@ def watch_until(supervisor: Supervisor, done: Callable[[], bool]) -> None:
 
 
 def alive(pid: int) -> bool:
-    """True for a process that runs; a zombie does not."""
+    """Return whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
 
 
-def test_a_process_that_fails_is_started_again_with_back_off_and_then_given_up(supervise, monkeypatch) -> None:
+def test_a_failing_process_is_restarted_with_back_off_until_the_run_fails(supervise, monkeypatch) -> None:
     monkeypatch.setattr(supervisors, "MAX_CRASHES", 4)
     supervisor = supervise(python("learner", "import sys; sys.exit(1)"))
     begin = time.monotonic()
@@ -102,10 +102,10 @@ def test_a_mistake_is_not_tried_again(supervise, code: int) -> None:
 
 
 def test_a_full_disk_is_named_at_once(supervise, monkeypatch) -> None:
-    """The process's own sentence finds no room in its file, and to start it again is no help."""
+    """The process's log has no space for its own sentence, and a restart would not help."""
     monkeypatch.setattr(supervisors, "FULL_DISK_BYTES", 2**62)
     supervisor = supervise(python("tmc", "import sys; sys.exit(1)", leads=True))
-    with pytest.raises(MissionFailed, match="is full; free some space, and go on with `overfly run --resume"):
+    with pytest.raises(MissionFailed, match="is full; free some space, and resume with `overfly run --resume"):
         watch_until(supervisor, lambda: False)
     assert supervisor.restarts() == {}
 
@@ -118,7 +118,7 @@ def test_the_mission_ends_with_its_leader(supervise) -> None:
 
 @pytest.fixture
 def once(tmp_path: Path) -> Callable[[str, float, int], Child]:
-    """A process that ends with `code` after `wait` seconds; started again, it stays."""
+    """Return a maker of processes that end with `code` after `wait` seconds; once restarted, they stay."""
 
     def make(name: str, wait: float, code: int) -> Child:
         text = (
@@ -130,16 +130,14 @@ def once(tmp_path: Path) -> Callable[[str, float, int], Child]:
     return make
 
 
-def test_who_left_before_the_tmc_was_back_is_started_again(supervise, once) -> None:
-    """Told that the mission is over, or that the TMC was stopped; the TMC's next incarnation may need them all the
-    same.
-    """
+def test_a_process_that_left_before_the_tmc_was_back_is_restarted(supervise, once) -> None:
+    """It left because the mission was over, or the TMC stopped. The TMC's next incarnation may still need it."""
     supervisor = supervise(once("tmc", 1.0, process.STOPPED), once("uav-000", 0.0, 0))
     watch_until(supervisor, lambda: supervisor.restarts() == {"tmc": 1, "uav-000": 1} and len(supervisor.pids()) == 2)
 
 
-def test_who_took_long_to_leave_a_tmc_that_was_killed_is_started_again(supervise, once, monkeypatch) -> None:
-    """Told that the mission is over by the TMC's last incarnation. PolicySpec came after that is not called back."""
+def test_a_process_that_left_a_killed_tmc_late_is_restarted(supervise, once, monkeypatch) -> None:
+    """The TMC's previous incarnation ended it. A process that started after the current TMC is not restarted."""
     monkeypatch.setattr(supervisors, "LEAVE_TIMEOUT_S", 1.0)
     supervisor = supervise(once("tmc", 0.5, process.STOPPED), once("learner", 4.0, 0))
     begin = time.monotonic()
@@ -147,9 +145,9 @@ def test_who_took_long_to_leave_a_tmc_that_was_killed_is_started_again(supervise
     assert time.monotonic() - begin > 5.0
     supervisor.running[1].started = supervisor.running[0].started - 1.0
     supervisor.running[1].left = time.monotonic() - 9.0
-    assert supervisor._left_a_former_life(supervisor.running[1])
+    assert supervisor._left_previous_incarnation(supervisor.running[1])
     supervisor.running[1].started = supervisor.running[0].started + 1.0
-    assert not supervisor._left_a_former_life(supervisor.running[1])
+    assert not supervisor._left_previous_incarnation(supervisor.running[1])
 
 
 def test_kills_from_outside_do_not_count(supervise, tmp_path: Path) -> None:
@@ -203,8 +201,8 @@ def test_a_lost_forkserver_is_replaced_and_its_uavs_come_back(supervise, tmp_pat
     assert supervisor.restarts() == {"uav-000": 1}
 
 
-def test_a_killed_learner_is_forked_anew_by_a_process_that_has_no_threads(supervise, tmp_path: Path) -> None:
-    """A fork takes no threads along: a pool that was there before would be gone, and waited for for ever."""
+def test_a_killed_learner_is_forked_again_by_a_process_without_threads(supervise, tmp_path: Path) -> None:
+    """A fork has none of the other threads: it would wait for ever for an earlier thread pool."""
     supervisor = supervise(learner(tmp_path))
     watch_until(supervisor, lambda: "learner" in supervisor.pids())
     before = supervisor.pids()
@@ -226,7 +224,7 @@ def test_a_forkserver_that_cannot_start_is_a_failure_not_a_kill(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("name", "package", "options"), [("uav-000", "actors", ("--id", "0")), ("learner", "learner", ())]
 )
-def test_everybody_dies_with_a_supervisor_that_is_killed(
+def test_all_processes_end_with_a_killed_supervisor(
     tmp_path: Path, name: str, package: str, options: tuple[str, ...]
 ) -> None:
     code = f"""
@@ -277,8 +275,8 @@ def threads_of(pid: int) -> int:
     return len(list(Path(f"/proc/{pid}/task").iterdir()))
 
 
-def test_processes_are_forked_from_one_that_has_no_threads(tmp_path: Path) -> None:
-    """A fork takes no threads along. What is preloaded starts none with the versions that are installed."""
+def test_processes_are_forked_from_one_without_threads(tmp_path: Path) -> None:
+    """A fork has none of the other threads. The preloaded modules start none with the installed versions."""
     plan = make(build({"team.size": 1}), tmp_path, policy=None)
     supervisor = Supervisor(plan, tmp_path, 1, lambda _: None)
     supervisor.start()
@@ -298,7 +296,7 @@ def test_processes_are_forked_from_one_that_has_no_threads(tmp_path: Path) -> No
 
 
 def test_a_preloaded_module_that_starts_a_thread_is_left_out(tmp_path: Path) -> None:
-    """As a later version of a library may: the forkserver starts over without it, under the same process id."""
+    """A later version of a library may: the forkserver starts again without it, under the same process id."""
     (tmp_path / "threaded.py").write_text(
         "import threading, time\nthreading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
     )
@@ -338,8 +336,8 @@ def test_a_program_that_cannot_be_started_is_one_sentence(supervise, tmp_path: P
         supervise(Child("tmc", (str(tmp_path / "none"),), restart=True, leads=True))
 
 
-def test_what_a_library_said_before_it_aborted_is_told(supervise, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As ZeroMQ does in a TMC that has no descriptor left."""
+def test_the_last_message_before_an_abort_is_shown(supervise, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ aborts so in a TMC without a free descriptor."""
     monkeypatch.setattr(supervisors, "MAX_CRASHES", 2)
     said = "Too many open files (src/ip_resolver.cpp:1)\\x1b[31m\\n"
     supervisor = supervise(python("tmc", f"import os; os.write(2, b'{said}'); os.abort()", leads=True))

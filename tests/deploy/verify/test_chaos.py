@@ -1,4 +1,4 @@
-"""`overfly verify chaos`, part by part: the judge sees what is lost, doubled or other; faults, cuts and their seeds."""
+"""The parts of `overfly verify chaos`: the checker finds lost, doubled and altered records; faults, cuts and seeds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def record(uav: int, sequence: int, cell: int = 7) -> m.Record:
 
 
 def prepare(out: Path, journalled: list[m.Record], acknowledged: list[m.Record]) -> None:
-    """A run folder in which the TMC has journalled these records, and the UAVs have acknowledged to those."""
+    """Make a run folder with these records in the journal, and these in the logs of acknowledgements."""
     (out / "acks").mkdir(parents=True)
     with LogWriter(out / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for one in journalled:
@@ -51,7 +51,7 @@ def prepare(out: Path, journalled: list[m.Record], acknowledged: list[m.Record])
 FLOWN = [record(uav, sequence) for sequence in range(4) for uav in range(2)]
 
 
-def test_what_was_sworn_and_is_there_is_neither_lost_nor_doubled(tmp_path: Path) -> None:
+def test_acknowledged_and_journalled_records_are_neither_lost_nor_doubled(tmp_path: Path) -> None:
     prepare(tmp_path, FLOWN, [*FLOWN[:6], replace(FLOWN[6], incarnation=99)])  # another incarnation, the same flight
     found = check_delivery(tmp_path)
     assert (found.acknowledged, found.journalled, found.lost, found.doubled) == (7, 8, 0, 0)
@@ -73,9 +73,9 @@ def test_another_digest_is_seen(tmp_path: Path) -> None:
     assert (check_delivery(tmp_path).lost, check_delivery(tmp_path).doubled) == (1, 0)
 
 
-def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same(tmp_path: Path) -> None:
+def test_a_record_that_was_lost_by_a_kill_and_flown_again_counts_as_lost(tmp_path: Path) -> None:
     prepare(tmp_path, FLOWN[:4], FLOWN[:7])
-    snapshot = Snapshot.take(tmp_path)
+    snapshot = Snapshot.capture(tmp_path)
     (tmp_path / "tmc.mcap").unlink()
     with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for one in FLOWN:
@@ -86,11 +86,11 @@ def test_a_record_that_was_lost_with_a_kill_and_flown_again_is_lost_all_the_same
     assert not list((tmp_path / "acks").glob("killed*"))
 
 
-# Blows.
+# Faults.
 
 
 @pytest.mark.parametrize("power", [False, True])
-def test_blows_are_drawn_from_their_seed(power: bool) -> None:
+def test_faults_are_drawn_from_their_seed(power: bool) -> None:
     drawn = draw_faults(200, 4, NAMES, power=power)
     assert drawn == draw_faults(200, 4, NAMES, power=power) != draw_faults(200, 5, NAMES, power=power)
     assert sum(fault.kills for fault in drawn) == 200
@@ -101,23 +101,23 @@ def test_blows_are_drawn_from_their_seed(power: bool) -> None:
     assert any(len(fault.targets) == 2 for fault in drawn) and all(0.1 <= fault.seconds <= 1.0 for fault in drawn)
 
 
-def test_what_a_missions_end_left_of_a_blow_falls_on_the_next_mission(tmp_path: Path) -> None:
-    schedule = FaultSchedule(draw_faults(1, 1, ["tmc"], power=False), lambda _: None, tmp_path / "diary.txt")
+def test_the_rest_of_a_fault_is_postponed_to_the_next_mission(tmp_path: Path) -> None:
+    schedule = FaultSchedule(draw_faults(1, 1, ["tmc"], power=False), lambda _: None, tmp_path / "history.txt")
     assert schedule.next is not None
     fault = schedule.next
-    schedule.started()
-    schedule.later(replace(fault, targets=()))
+    schedule.start_next()
+    schedule.postpone(replace(fault, targets=()))
     assert schedule.next is None or schedule.next.kind != KILL
-    schedule.later(fault)
+    schedule.postpone(fault)
     assert schedule.next == fault
 
 
-def test_updates_that_a_checkpoint_takes_back_are_no_growth() -> None:
+def test_updates_lost_by_a_restart_do_not_reduce_the_growth() -> None:
     growth = Growth()
     status = m.Status("flying", 1, 10, 10, 100, 1, 0.0, 0.0, 0.0, 0, 0, "")
     for updates in (100, 103, 40, 42):
-        growth.take(replace(status, updates=updates))
-        growth.take(None)
+        growth.update(replace(status, updates=updates))
+        growth.update(None)
     assert (growth.ticks, growth.updates) == (0, 5)
 
 
@@ -138,7 +138,7 @@ def test_a_power_cut_leaves_what_was_synced(tmp_path: Path) -> None:
     assert len(left) > 20 and (tmp_path / "uav-000.mcap.active").stat().st_size <= 100
 
 
-def test_a_journal_that_was_just_taken_over_was_synced_as_a_whole(tmp_path: Path) -> None:
+def test_a_journal_that_was_just_replaced_was_synced_as_a_whole(tmp_path: Path) -> None:
     journal = tmp_path / "tmc.mcap.active"
     journal.write_bytes(bytes(200))
     (tmp_path / "acks").mkdir()
@@ -146,12 +146,12 @@ def test_a_journal_that_was_just_taken_over_was_synced_as_a_whole(tmp_path: Path
     assert cut_tails(tmp_path, Random(1)) == 0 and journal.stat().st_size == 200
 
 
-# The wire.
+# The proxy.
 
 
 @pytest.fixture
 def line(short: Path) -> Iterator[tuple[Forwarder, socket.socket, Path]]:
-    """A forwarder, the listener behind it, and where it listens itself."""
+    """Yield a forwarder, the listener behind it, and the path that it listens at."""
     front, back = short / "front", short / "back"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(back))

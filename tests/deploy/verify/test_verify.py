@@ -1,4 +1,4 @@
-"""`overfly verify`: no difference where there is none, and the first one by name, tick and UAV where there is one."""
+"""`overfly verify` finds no difference where there is none, and otherwise names the first by fact, tick and UAV."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_small_missions_under_stalls_show_no_difference(capsys: pytest.CaptureFi
     out, err = capsys.readouterr()
     rows = [line.split() for line in out.splitlines()[1:] if line.endswith("no difference")][:-1]
     assert [row[:6] for row in rows] == [
-        ["1", "2", "7", "together", "1", "60"],  # alone, there is nobody to be staggered with
+        ["1", "2", "7", "together", "1", "60"],  # a single UAV cannot be staggered
         ["2", "2", "7", "together", "1", "120"],
         ["2", "2", "7", "staggered", "1", "120"],
         ["3", "2", "7", "together", "1", "180"],
@@ -46,7 +46,7 @@ def test_small_missions_under_stalls_show_no_difference(capsys: pytest.CaptureFi
     assert err.startswith("mission 1 of 5\n")
 
 
-def test_json_is_a_line_a_mission(capsys: pytest.CaptureFixture[str], town: Path) -> None:
+def test_json_is_a_line_per_mission(capsys: pytest.CaptureFixture[str], town: Path) -> None:
     options = ["--actors", "3", "--ticks", "20", "--scenarios", "1", "--map", str(town), "--json"]
     assert main(["verify", "exactness", *options]) == 0
     (row,) = map(json.loads, capsys.readouterr().out.splitlines())
@@ -57,7 +57,7 @@ def test_json_is_a_line_a_mission(capsys: pytest.CaptureFixture[str], town: Path
 def test_lock_step_with_blind_uavs_is_caught(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, town: Path, tmp_path: Path
 ) -> None:
-    """A mistake in the airspace of one side alone: what is named is the first thing that follows from it."""
+    """A mistake in the airspace of one side alone: the first fact that follows from it is named."""
     monkeypatch.setattr(Airspace, "sense", lambda *_: [])
     out = tmp_path / "kept"
     options = ["--actors", "4", "--ticks", "30", "--scenarios", "2", "--tu", "5", "--phases", "together"]
@@ -101,7 +101,7 @@ def alter(path: Path) -> None:
             log.write(entry.topic, m)
 
 
-def test_nothing_is_left_behind_when_all_is_well(tmp_path: Path) -> None:
+def test_nothing_is_left_behind_when_all_checks_pass(tmp_path: Path) -> None:
     out = tmp_path / "none"
     options = ["--actors", "1", "--ticks", "10", "--scenarios", "2", "--tu", "5"]
     assert main(["verify", "exactness", *options, "--out", str(out)]) == 0
@@ -111,10 +111,10 @@ def test_nothing_is_left_behind_when_all_is_well(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--actors", "1,x"), "'x' cannot be; list numbers"),
+        (("--actors", "1,x"), "'x' is not valid; list numbers"),
         (("--scenarios", "3"), "scenario = 3 is out of range"),
         (("--phases", "never"), "list together, staggered"),
-        (("--tu", ""), "'' cannot be; list numbers"),
+        (("--tu", ""), "'' is not valid; list numbers"),
         (("--seeds", "0"), "--seeds must be 1 or more"),
         (("--actors", "400"), "team.size = 400 is larger"),
         (("--who", "planner:genius"), "there is no planner"),
@@ -150,7 +150,7 @@ def test_every_schedule_of_exchanges_is_flown_once() -> None:
         ]
         for seed in (4, 5)
     ]  # fmt: skip
-    assert next(share for _, _, share in exactness.timed(found)) == 0.0
+    assert next(share for _, _, share in exactness.with_progress(found)) == 0.0
 
 
 # Asynchrony.
@@ -158,18 +158,18 @@ def test_every_schedule_of_exchanges_is_flown_once() -> None:
 
 @pytest.mark.parametrize("team", [2, 3, 10, 60])
 @pytest.mark.parametrize("apart", [True, False])
-def test_the_one_that_is_held_back_starts_alone_or_among_the_others(tmp_path: Path, team: int, apart: bool) -> None:
+def test_the_delayed_uav_starts_alone_or_among_the_others(tmp_path: Path, team: int, apart: bool) -> None:
     raster = asynchrony.raster(team, apart=apart)
     rows = parse_text(raster, "here")[1]
-    assert len(rows) == len(rows[0]) == asynchrony.SIDE
+    assert len(rows) == len(rows[0]) == asynchrony.SIDE_CELLS
     path = tmp_path / "corners.txt"
     path.write_text(raster)
     trial = asynchrony.Trial("", apart=apart, period=10, ticks=20)
-    config, held_back = asynchrony.config_of(trial, team, 0.1, {"team.controller": "planner:greedy"}, path)
-    assert (config.trial.stall, config.trial.stall_uav) == (0.1, held_back)
+    config, delayed_uav = asynchrony.config_of(trial, team, 0.1, {"team.controller": "planner:greedy"}, path)
+    assert (config.trial.stall, config.trial.stall_uav) == (0.1, delayed_uav)
     starts = exactness.check(config).starts(1)
-    chebyshev = Grid(asynchrony.SIDE, asynchrony.SIDE).chebyshev
-    away = [chebyshev(starts[held_back], cell) for i, cell in enumerate(starts) if i != held_back]
+    chebyshev = Grid(asynchrony.SIDE_CELLS, asynchrony.SIDE_CELLS).chebyshev
+    away = [chebyshev(starts[delayed_uav], cell) for i, cell in enumerate(starts) if i != delayed_uav]
     assert min(away) > 95 if apart else max(away) < 15
 
 
@@ -188,22 +188,22 @@ QUICK = {"team.controller": "planner:greedy", "training.episodes": 1}
 def test_what_bounds_the_lead(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, trial: asynchrony.Trial, bound: str, least: int
 ) -> None:
-    monkeypatch.setattr(asynchrony, "SIDE", 40)
+    monkeypatch.setattr(asynchrony, "SIDE_CELLS", 40)
     result = asynchrony.fly(trial, 3, 0.05, QUICK, None, tmp_path / "flight")
-    assert result.good, result.row()
-    assert result.ahead.bound == bound and result.ahead.ticks >= least
-    assert result.ahead.ticks <= max(result.ahead.cells, 1)
+    assert result.passed, result.row()
+    assert result.lead.bound == bound and result.lead.ticks >= least
+    assert result.lead.ticks <= max(result.lead.cells, 1)
     assert not (tmp_path / "flight").exists()
 
 
 def test_a_lead_that_no_rule_allows_is_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Two UAVs side by side, one of which says that it was 5 ticks ahead."""
+    """Two UAVs side by side, one of which logs a lead of 5 ticks."""
     config = build({"team.size": 2, "world.map": "none"})
     facts = {(1, t, compare.KINDS.index("cell"), i): 10 + i for t in range(10) for i in range(2)}
     status = type("Status", (), {"lead_most": 5, "lead_tick": 7, "lead_bound": "distance"})
     monkeypatch.setattr(asynchrony, "run_files", lambda _: {"uav-001": tmp_path})
     monkeypatch.setattr(asynchrony, "read", lambda *_: [type("LogMessage", (), {"message": status})])
-    ahead = asynchrony.farthest(config, facts, tmp_path, 0)
-    assert (ahead.ticks, ahead.uav, ahead.at, ahead.cells, ahead.right) == (5, 1, 7, 1, False)
-    result = asynchrony.Result(asynchrony.TRIALS[3], 0, ahead, 1.0, None)
-    assert not result.good and result.row().endswith("RAN AHEAD WRONGLY")
+    lead = asynchrony.farthest(config, facts, tmp_path, 0)
+    assert (lead.ticks, lead.uav, lead.at_tick, lead.cells, lead.allowed) == (5, 1, 7, 1, False)
+    result = asynchrony.Result(asynchrony.TRIALS[3], 0, lead, 1.0, None)
+    assert not result.passed and result.row().endswith("LEAD NOT ALLOWED")

@@ -430,7 +430,7 @@ def test_every_invariant_is_broken_by_some_journal() -> None:
 def test_the_first_violation_is_named(fly: Fly, tmp_path: Path) -> None:
     folder = altered(fly(**CROWD), tmp_path / "altered", once("/uav/3/record", plus("rewards", 0.5, 4), tick=20)())
     violation = broken(check(folder))["own rewards"]
-    assert violation.startswith("episode 1, tick 15, UAV 3: it reckons ")
+    assert violation.startswith("episode 1, tick 15, UAV 3: ") and " is recorded, its map gives " in violation
     row = next(line for line in check(folder).table() if line.startswith("own rewards"))
     assert "VIOLATED: episode 1, tick 15, UAV 3" in row
     assert "1 of 22 invariants are violated" in check(folder).summary()
@@ -489,4 +489,4 @@ def test_no_journal(tmp_path: Path) -> None:
 
 def test_a_journal_without_a_flight_does_not_pass(fly: Fly, tmp_path: Path) -> None:
     folder = altered(fly(**CROWD), tmp_path / "empty", lambda _topic, _message: iter(()))
-    assert broken(check(folder)) == {"episodes": "there is none: nothing was flown, or nothing of it is left"}
+    assert broken(check(folder)) == {"episodes": "there is no episode: nothing was flown, or its records are lost"}

@@ -17,7 +17,7 @@ from tmc.analysis.report.map_figures import values_at
 from tmc.analysis.report.pictures import PictureError, draw_map
 from tmc.analysis.run_data import read
 from tmc.kernel.roadmap import load_map, parse_raster
-from tmc.record import facts
+from tmc.record import queries
 from tmc.record.errors import RecordError
 
 SCENARIO_1 = {"scenario": 1, "team.controller": "planner:greedy", "training.episodes": 2, "world.alpha": 0.2}
@@ -65,7 +65,7 @@ def test_the_ground_of_the_paths_is_the_true_map_at_that_tick(fly):
     for values in ({}, SCENARIO_1, {"world.initial_map": "random"}):
         folder = fly(**values)
         flown = read(folder)
-        curve = dict(facts.uncertainty(folder, 1))
+        curve = dict(queries.uncertainty(folder, 1))
         for tick in (0, 1, 17, 60):
             assert np.nansum(values_at(flown.world, flown.episodes[0], tick)) == pytest.approx(curve[tick])
 

@@ -1,4 +1,4 @@
-"""No fact of a journal can be changed, left out or told twice, whichever it is, without some invariant noticing."""
+"""No fact of a journal can be changed, left out or repeated without violating an invariant."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from tmc.analysis.invariants.check import INVARIANTS
-from tmc.analysis.invariants.episode_log import Gathering
+from tmc.analysis.invariants.episode_log import EpisodeCollector
 from tmc.analysis.invariants.recompute import truth
 from tmc.analysis.run_config import world_of
 from tmc.kernel.world import World
@@ -30,7 +30,7 @@ NO_FACTS = frozenset((
     "timestamp", "frame_id", "pose", "cell_size", "fields",  # how a map is drawn
 ))  # fmt: skip
 TOPICS = ("/uav/", "/tmc/sync", "/tmc/episode", "/tmc/events", "/tmc/metrics", "/tmc/last_visit")
-"""What is checked: the digests of `/tmc/state` are for whoever plays the journal."""
+"""The topics that are checked. The digests of `/tmc/state` are checked by replaying the journal."""
 FLOATS = (1, 2)
 """Kinds of protobuf fields: double and float."""
 
@@ -38,9 +38,9 @@ FLOATS = (1, 2)
 def violated(world: World, entries: list[LogMessage]) -> set[str]:
     """The invariants that do not hold."""
     found = set()
-    for e in Gathering(world).episodes(entries):
-        reckoned = truth(e)
-        found |= {name for name, _, law in INVARIANTS if law(e, reckoned).violation}
+    for e in EpisodeCollector(world).episodes(entries):
+        reference = truth(e)
+        found |= {name for name, _, invariant in INVARIANTS if invariant(e, reference).violation}
     return found
 
 

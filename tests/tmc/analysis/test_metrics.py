@@ -17,7 +17,7 @@ from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.roadmap import load_map
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
-from tmc.record import facts, schemas
+from tmc.record import queries, schemas
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
@@ -46,10 +46,10 @@ def age_sum(world, moves, ticks):
 def test_uncertainty_is_eq_6_and_the_ratio_that_to_the_bound(fly):
     folder = fly()
     s, world = summary(folder), world_of(folder)
-    expected = age_sum(world, facts.moves(folder, 1), 60)
+    expected = age_sum(world, queries.moves(folder, 1), 60)
     bound = lower_bound(world.alpha, 3, 60)
     assert s.last.uncertainty == pytest.approx(expected, rel=1e-12)
-    assert s.last.uncertainty == pytest.approx(facts.episodes(folder)[-1].uncertainty, rel=1e-12)
+    assert s.last.uncertainty == pytest.approx(queries.episodes(folder)[-1].uncertainty, rel=1e-12)
     assert s.last.per_cell == pytest.approx(expected / 323, rel=1e-12)
     assert s.lower_bound == pytest.approx(bound, rel=1e-12)
     assert s.last.times_bound == pytest.approx(expected / bound, rel=1e-12)
@@ -59,7 +59,7 @@ def test_uncertainty_is_eq_6_and_the_ratio_that_to_the_bound(fly):
 def test_roads_come_from_the_cells_flown(fly):
     folder = fly()
     s, road = summary(folder), set(np.flatnonzero(world_of(folder).map.road).tolist())
-    moves = list(facts.moves(folder, 1))
+    moves = list(queries.moves(folder, 1))
     over = [cell in road for tick, _, cell in moves if tick]
     assert s.last.on_road == pytest.approx(sum(over) / len(over))
     assert s.last.coverage == pytest.approx(len(road & {cell for _, _, cell in moves}) / len(road))
@@ -69,7 +69,7 @@ def test_roads_come_from_the_cells_flown(fly):
 def test_blocked_moves_and_reward_are_those_of_the_episodes(fly):
     folder = fly(**{"training.episodes": 2, "team.size": 12})
     s = summary(folder)
-    ends = [e for e in facts.episodes(folder) if e.phase == "end"]
+    ends = [e for e in queries.episodes(folder) if e.phase == "end"]
     assert (s.blocked_grid, s.blocked_obstacle, s.blocked_uav) == tuple(
         sum(getattr(e, f"blocked_{cause}") for e in ends) for cause in ("grid", "obstacle", "uav")
     )
@@ -83,14 +83,14 @@ def test_events_wait_from_the_slot_they_appear_in_to_the_next_visit(fly):
     folder = fly(**SCENARIO_1)
     s = summary(folder)
     for found in s.episodes:
-        moves = list(facts.moves(folder, found.episode))
-        events = list(facts.events(folder, found.episode))
+        moves = list(queries.moves(folder, found.episode))
+        events = list(queries.events(folder, found.episode))
         waits = [min((t - tick for t, _, c in moves if c == cell and t > tick), default=None) for tick, cell in events]
         done = [w for w in waits if w is not None]
         assert (found.events_appeared, found.events_cleared) == (len(events), len(done))
         assert found.mean_wait == pytest.approx(sum(done) / len(done))
         # What appeared and was not cleared is what is active at the end.
-        assert len(events) - len(done) == dict(facts.uncertainty(folder, found.episode))[60]
+        assert len(events) - len(done) == dict(queries.uncertainty(folder, found.episode))[60]
     assert s.lower_bound is None and s.last.times_bound is None
 
 
@@ -104,7 +104,7 @@ def test_a_fixed_mission_means_all_episodes_and_training_the_last_tenth(fly, lea
     assert s.mean.episodes == 2 and not s.mission.learning
     assert s.mean.uncertainty == pytest.approx(np.mean([e.uncertainty for e in s.episodes]))
     t = summary(learned)
-    assert t.mission.learning and t.mission.who == "a policy in training"
+    assert t.mission.learning and t.mission.controller == "a policy in training"
     assert (t.mean.episodes, t.mean.uncertainty) == (1, t.last.uncertainty)
     assert t.best.uncertainty == min(e.uncertainty for e in t.episodes)
     assert t.pace.ticks == 180 and t.pace.updates > 100 and t.pace.loss is not None
@@ -113,7 +113,14 @@ def test_a_fixed_mission_means_all_episodes_and_training_the_last_tenth(fly, lea
 
 def test_mission_says_what_was_planned(fly):
     m = summary(fly(**SCENARIO_1)).mission
-    assert (m.who, m.scenario, m.uavs, m.T_u, m.map, m.seed) == ("planner:greedy", 1, 3, 1, "downtown-toronto", 3)
+    assert (m.controller, m.scenario, m.uavs, m.T_u, m.map, m.seed) == (
+        "planner:greedy",
+        1,
+        3,
+        1,
+        "downtown-toronto",
+        3,
+    )
     assert (m.episodes_flown, m.episodes_planned, m.ticks, m.road_cells) == (2, 2, 60, 323)
 
 
@@ -152,7 +159,7 @@ def test_a_cut_log_gives_what_is_sound(long_run, tmp_path):
     assert s.last.episode == 1
     assert any("cut" in note for note in s.health.notes)
     partial = read(folder).episodes[1]
-    whole_curve = [u for _, u in facts.uncertainty(long_run, 2)]
+    whole_curve = [u for _, u in queries.uncertainty(long_run, 2)]
     assert s.episodes[1].uncertainty == pytest.approx(np.mean(whole_curve[1 : partial.ticks + 1]))
 
 
@@ -237,7 +244,7 @@ def test_without_config_json_the_log_has_it(fly, tmp_path):
     assert summary(folder).episodes == summary(fly()).episodes
     for broken in ('{"scenario": 7}', "", "[]"):  # an empty one is what a power cut may leave
         (folder / "config.json").write_text(broken)
-        assert "config.json: no config, the log's is used" in summary(folder).health.notes
+        assert "config.json: not a config; the log's settings are used" in summary(folder).health.notes
         assert summary(folder).episodes == summary(fly()).episodes
     data = bytearray((folder / "tmc.mcap").read_bytes())
     data[data.index(b'"world.map"')] = ord("}")
@@ -258,7 +265,7 @@ def test_the_settings_in_the_log_count_and_the_edited_ones_are_named(fly, tmp_pa
     (folder / "config.json").write_text(json.dumps(config | {"team.size": 2, "training.seed": 99}))
     s = summary(folder)
     assert (s.mission.uavs, s.mission.seed, s.episodes) == (3, 3, summary(fly()).episodes)
-    note = "config.json: team.size, training.seed changed since the run, the log's settings are used"
+    note = "config.json: team.size, training.seed changed since the run; the log's settings are used"
     assert list(s.health.notes) == [note]
     (folder / "config.json").write_text(json.dumps({k: v for k, v in config.items() if k != "training.seed"}))
     assert "config.json: training.seed changed" in summary(folder).health.notes[0]
@@ -273,7 +280,7 @@ def test_the_copy_of_the_map_in_the_run_folder_counts(fly, tmp_path):
     s = summary(folder)
     assert (s.mission.map, s.mission.cell_m, s.health.notes) == ("Old town", 25.0, ())
     (folder / "map.txt").write_text("#########\n#...X...#\n#########\n")
-    assert "map map.txt: changed since the run, the log's is used" in summary(folder).health.notes
+    assert "map map.txt: changed since the run; the log's copy is used" in summary(folder).health.notes
     assert summary(folder).episodes == s.episodes
 
 

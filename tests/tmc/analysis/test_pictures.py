@@ -100,7 +100,7 @@ def test_a_name_is_drawn_as_it_is_written(
     monkeypatch.setattr(style, "save", lambda made, path: (drawn.extend(made.findobj(Text)), save(made, path))[1])
     flown = read(learned)
     summary = summarize(flown)
-    summary = dataclasses.replace(summary, mission=dataclasses.replace(summary.mission, map=name, who=name))
+    summary = dataclasses.replace(summary, mission=dataclasses.replace(summary.mission, map=name, controller=name))
     road_map = dataclasses.replace(flown.world.map, name=name)
     figures.map_picture(road_map, tmp_path / "map.png")
     figures.curves_picture(flown, summary, tmp_path / "curves.png", {name: 0.3})

@@ -30,15 +30,16 @@ from tmc.analysis import palette
 from tmc.analysis.viewer import replay_file
 from tmc.analysis.viewer.layout import FILE, topics_of
 from tmc.analysis.viewer.messages import SHAPES
-from tmc.analysis.viewer.replay_file import TICK_NS, TRAIL, place
+from tmc.analysis.viewer.replay_file import TICK_NS, TRAIL_TICKS, centre_of
 from tmc.center.journal import Journal
 from tmc.kernel.config import build
 from tmc.kernel.roadmap import parse_raster
 from tmc.kernel.world import World
-from tmc.record import builders, facts
+from tmc.record import builders, queries
 from tmc.record.channels import REPLAY_CHANNELS
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, run_files
+from tmc.record.reader import Log
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 
@@ -134,7 +135,7 @@ def true_last_visits(folder: Path, world: World, episode: int) -> list[dict[int,
     """For each tick {cell: tick of the last visit}, from the moves alone."""
     visits: list[dict[int, int]] = []
     last: dict[int, int] = {}
-    for tick, _, cell in facts.moves(folder, episode):
+    for tick, _, cell in queries.moves(folder, episode):
         if tick == len(visits):
             visits.append({})
         last[cell] = tick
@@ -154,7 +155,7 @@ def test_the_true_map_of_each_tick_follows_from_the_moves(flown: RunData) -> Non
 
 
 def test_the_uncertainty_of_the_true_map_is_what_the_tmc_logged(flown: RunData) -> None:
-    found, logged = messages(replay(flown.folder)), dict(facts.uncertainty(flown.folder, 2))
+    found, logged = messages(replay(flown.folder)), dict(queries.uncertainty(flown.folder, 2))
     for tick, grid in ticks_of(found, "/tmc/last_visit"):
         assert builders.layer(grid, "uncertainty").sum(dtype=np.float64) == pytest.approx(logged[tick], rel=1e-5)
     for tick, message in ticks_of(found, "/tmc/tick"):
@@ -169,9 +170,9 @@ def test_events_are_where_they_are_until_somebody_comes(flown: RunData) -> None:
         return
     found, active = messages(replay(flown.folder)), set[int]()
     appear, cells = defaultdict(set), defaultdict(set)
-    for tick, cell in facts.events(flown.folder, 2):
+    for tick, cell in queries.events(flown.folder, 2):
         appear[tick].add(cell)
-    for tick, _, cell in facts.moves(flown.folder, 2):
+    for tick, _, cell in queries.moves(flown.folder, 2):
         cells[tick].add(cell)
     most = 0
     for tick, grid in ticks_of(found, "/tmc/last_visit"):
@@ -207,7 +208,7 @@ def test_beliefs_of_the_tmc_are_those_that_it_logged(flown: RunData) -> None:
 
 def test_where_everybody_is(flown: RunData) -> None:
     world, found = flown.world, messages(replay(flown.folder))
-    cells = {(tick, uav): cell for tick, uav, cell in facts.moves(flown.folder, 2)}
+    cells = {(tick, uav): cell for tick, uav, cell in queries.moves(flown.folder, 2)}
     for uav in range(world.config.team.size):
         for tick, message in ticks_of(found, f"/uav/{uav}/tick"):
             assert (message.tick, message.uav, message.cell) == (tick, uav, cells[tick, uav])
@@ -216,7 +217,7 @@ def test_where_everybody_is(flown: RunData) -> None:
             at = message.pose.position
             assert (message.frame_id, at.x, at.y, at.z) == ("map", 60 * col + 30, 60 * (world.grid.rows - row) - 30, 0)
             if tick and cells[tick, uav] != cells[tick - 1, uav]:
-                before = place(world, cells[tick - 1, uav])
+                before = centre_of(world, cells[tick - 1, uav])
                 yaw = 2 * math.atan2(message.pose.orientation.z, message.pose.orientation.w)
                 towards = math.atan2(at.y - before[1], at.x - before[0])
                 assert math.isclose(math.cos(yaw - towards), 1.0)
@@ -226,13 +227,13 @@ def test_where_everybody_is(flown: RunData) -> None:
 
 def test_the_scene_shows_each_uav_with_its_trail(flown: RunData) -> None:
     found, size = messages(replay(flown.folder)), flown.world.config.team.size
-    cells = {(tick, uav): cell for tick, uav, cell in facts.moves(flown.folder, 2)}
+    cells = {(tick, uav): cell for tick, uav, cell in queries.moves(flown.folder, 2)}
     assert len(found["/scene"]) == T + 1
     for tick, message in ticks_of(found, "/scene"):
         assert [e.id for e in message.entities] == [f"uav-{i}" for i in range(size)] and not message.deletions
         for uav, entity in enumerate(message.entities):
             (line,), (text,) = entity.lines, entity.texts
-            expected = [place(flown.world, cells[t, uav]) for t in range(max(0, tick - TRAIL + 1), tick + 1)]
+            expected = [centre_of(flown.world, cells[t, uav]) for t in range(max(0, tick - TRAIL_TICKS + 1), tick + 1)]
             assert [(p.x, p.y) for p in line.points] == expected
             (body,) = [*entity.spheres, *entity.cubes, *entity.cylinders]
             assert (body.pose.position.x, body.pose.position.y) == expected[-1] and text.text == str(uav)
@@ -359,14 +360,14 @@ def losing(mission: LockStep) -> None:
 def test_a_lost_uav_is_there_until_its_last_record(tmp_path: Path) -> None:
     flown = fly(tmp_path / "run", losing, **{"world.alpha": 0.01})
     found = messages(replay(flown.folder, 1))
-    last = max(tick for tick, uav, _ in facts.moves(flown.folder, 1) if uav == 1)
+    last = max(tick for tick, uav, _ in queries.moves(flown.folder, 1) if uav == 1)
     assert 10 <= last < 25
     assert [t for t, _ in ticks_of(found, "/uav/1/belief")] == list(range(last + 1))
     assert [t for t, _ in ticks_of(found, "/uav/0/belief")] == list(range(T + 1))
     for tick, scene in ticks_of(found, "/scene"):
         assert ([e.id for e in scene.entities] == ["uav-0", "uav-1", "uav-2"]) is (tick <= last)
         assert [d.id for d in scene.deletions] == ([] if tick <= last else ["uav-1"])
-    logged = dict(facts.uncertainty(flown.folder, 1))
+    logged = dict(queries.uncertainty(flown.folder, 1))
     for tick, message in ticks_of(found, "/tmc/tick"):
         assert message.uncertainty == pytest.approx(logged[tick], rel=1e-12)
         assert message.uavs == (3 if tick <= last else 2)
@@ -388,13 +389,13 @@ def test_a_cut_log_is_replayed_as_far_as_it_goes(together: RunData, tmp_path: Pa
     (long / "tmc.mcap").write_bytes(data[: len(data) // 3])
     made = replay_file.write(long, 1, tmp_path / "cut.mcap")
     found = messages(made.path)
-    assert 20 < made.flown.ticks < 400 and not made.flown.whole
-    assert made.flown.damage is not None and "it is cut" in made.flown.damage
-    assert [t for t, _ in ticks_of(found, "/scene")] == list(range(made.flown.ticks + 1))
+    assert 20 < made.timeline.ticks < 400 and not made.timeline.whole
+    assert made.timeline.damage is not None and "it is cut" in made.timeline.damage
+    assert [t for t, _ in ticks_of(found, "/scene")] == list(range(made.timeline.ticks + 1))
     assert set(found) == set(whole)
     (long / "tmc.mcap").rename(long / "tmc.mcap.active")
-    again = replay_file.write(long, 1, tmp_path / "active.mcap").flown
-    assert (again.damage, again.ticks, again.whole) == (None, made.flown.ticks, False)
+    again = replay_file.write(long, 1, tmp_path / "active.mcap").timeline
+    assert (again.damage, again.ticks, again.whole) == (None, made.timeline.ticks, False)
 
 
 def test_the_same_log_gives_the_same_file(together: RunData, tmp_path: Path) -> None:
@@ -467,8 +468,3 @@ def test_rerun_finds_every_topic_in_order(together: RunData) -> None:
     rows = [line.split() for line in done.stdout.splitlines() if " /" in line]
     assert {row[0] for row in rows} == {"ok"}, done.stdout
     assert {row[3] for row in rows} == set(messages(path))
-
-
-def test_the_colours_are_those_of_the_pictures() -> None:
-    style = pytest.importorskip("tmc.analysis.report.style")
-    assert style.UAV_COLOURS == palette.UAV_COLOURS

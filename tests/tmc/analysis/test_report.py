@@ -53,7 +53,7 @@ def test_it_says_the_numbers(fly):
 
 def test_scenario_1_and_training_say_more(fly, learned):
     events = text(summary(fly(**SCENARIO_1)))
-    assert "Active events, mean of ticks" in events and "appeared" in events and "mean of 2 episodes" in events
+    assert "Active events, mean over ticks" in events and "appeared" in events and "mean of 2 episodes" in events
     assert "updates" in text(summary(learned)) and "UAVs in training" in text(summary(learned))
 
 

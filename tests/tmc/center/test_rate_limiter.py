@@ -31,24 +31,24 @@ def test_one_minibatch_a_tick_as_in_algorithm_1() -> None:
         assert rate_limiter.samples_due == 0 and rate_limiter.updates == tick
 
 
-@pytest.mark.parametrize(("ratio", "slack"), [(1.0, 5), (0.25, 8), (4.0, 2), (0.01, 1)])
-def test_inserts_are_held_back_beyond_the_slack_and_no_sooner(ratio: float, slack: int) -> None:
-    rate_limiter = RateLimiter(ratio, slack, 1)
+@pytest.mark.parametrize(("ratio", "error_buffer"), [(1.0, 5), (0.25, 8), (4.0, 2), (0.01, 1)])
+def test_inserts_are_held_back_beyond_the_slack_and_no_sooner(ratio: float, error_buffer: int) -> None:
+    rate_limiter = RateLimiter(ratio, error_buffer, 1)
     rate_limiter.insert(1, 1)
     for ahead in range(1, 300):
         rate_limiter.insert(1, 1)
         assert rate_limiter.samples_due == int(ahead * ratio + 1e-9)
-        assert rate_limiter.can_insert == (rate_limiter.samples_due <= slack * ratio)
+        assert rate_limiter.can_insert == (rate_limiter.samples_due <= error_buffer * ratio)
     assert not rate_limiter.can_insert
     while not rate_limiter.can_insert:
         rate_limiter.sample()
-    assert rate_limiter.samples_due == int(slack * ratio)
+    assert rate_limiter.samples_due == int(error_buffer * ratio)
 
 
-def test_a_minibatch_that_is_not_owed_is_refused() -> None:
+def test_a_minibatch_that_is_not_due_is_refused() -> None:
     rate_limiter = RateLimiter(1.0, 5, 1)
     before = copy.copy(rate_limiter)
-    with pytest.raises(ValueError, match="no minibatch is owed"):
+    with pytest.raises(ValueError, match="no minibatch is due"):
         rate_limiter.sample()
     assert rate_limiter == before
 
@@ -60,14 +60,14 @@ def test_without_a_learner_nothing_is_sampled_and_nothing_held_back() -> None:
 
 
 @given(
-    ratio=st.floats(0.0, 8.0), slack=st.integers(1, 50), learn_start=st.integers(1, 40),
+    ratio=st.floats(0.0, 8.0), error_buffer=st.integers(1, 50), learn_start=st.integers(1, 40),
     what=st.lists(st.tuples(st.booleans(), st.integers(1, 12)), max_size=120),
 )  # fmt: skip
 def test_the_two_sides_stay_together_whatever_they_do(
-    ratio: float, slack: int, learn_start: int, what: list[tuple[bool, int]]
+    ratio: float, error_buffer: int, learn_start: int, what: list[tuple[bool, int]]
 ) -> None:
-    """Samples never exceed what is owed; whenever one side is held back the other may go on."""
-    rate_limiter, transitions, largest = RateLimiter(ratio, slack, learn_start), 0, 0
+    """Samples never exceed what is due; whenever one side is held back the other may go on."""
+    rate_limiter, transitions, largest = RateLimiter(ratio, error_buffer, learn_start), 0, 0
     for insert, ticks in what:
         if insert and rate_limiter.can_insert:
             transitions, largest = transitions + ticks, max(largest, ticks)
@@ -81,4 +81,4 @@ def test_the_two_sides_stay_together_whatever_they_do(
         since = rate_limiter.ticks - rate_limiter.origin
         assert rate_limiter.updates <= since * ratio
         assert rate_limiter.samples_due == int(since * ratio) - rate_limiter.updates
-        assert rate_limiter.samples_due <= slack * ratio + largest * ratio + 1
+        assert rate_limiter.samples_due <= error_buffer * ratio + largest * ratio + 1

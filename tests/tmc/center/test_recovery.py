@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from tmc.__main__ import run_of
 from tmc.analysis.invariants.check import check
 from tmc.center import recovery
+from tmc.center.commit_gate import is_binding
 from tmc.center.entries import JournalEntry
 from tmc.center.journal import Journal, policy_path
 from tmc.center.roster import LEARNER, Outbox, uav_name
-from tmc.center.service import binds
 from tmc.center.station import Station
 from tmc.kernel.config import ConfigError, build
 from tmc.kernel.roadmap import RoadMap
@@ -173,7 +173,7 @@ def give_up(station: Station, i: int) -> None:
     episode = station.episode
     assert episode is not None
     station.lose(episode, i)
-    station.reorder_buffer.accept(station, episode)
+    station._accept_ready(episode)
     station.finalise()
 
 
@@ -300,7 +300,7 @@ def test_a_tmc_killed_in_flight_flies_the_same(
     rough, rng = mission(case.values, town), Random(seed)
 
     def groups() -> bool:
-        due = rough.station.phase == "done" or any(binds(message) for _, message in rough.station.out.sends)
+        due = rough.station.phase == "done" or any(is_binding(message) for _, message in rough.station.out.sends)
         return rng.random() < 0.2 or due  # as the service does
 
     rough.groups = groups
@@ -392,7 +392,7 @@ CONTRADICTIONS: dict[str, tuple[Callable[[list[JournalEntry]], list[JournalEntry
     "of another episode": (lambda es: later_record(es, episode=2), "has a record of episode 2 out of turn"),
     "a jump": (
         lambda es: later_record(es, cells=es[at(es, "/uav/0/record", 2)].values["record"].cells[::-1].copy() * 0 + 1),
-        "the journal contradicts itself, so do not go on with it: record of UAV 0",
+        "the journal contradicts itself, so do not resume from it: record of UAV 0",
     ),
     "an episode is missing": (
         lambda es: es[: at(es, "/tmc/episode", 0)] + es[at(es, "/tmc/episode", 2) :],

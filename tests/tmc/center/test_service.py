@@ -18,10 +18,10 @@ import zmq
 from actors.pilot import Pilot
 from actors.planners import LocalState
 from actors.tracks import TableTracks, TrackTable
+from tmc.center.commit_gate import MAX_TICKS_UNCOMMITTED
 from tmc.center.journal import journal_in
 from tmc.center.recovery import recover
 from tmc.center.roster import LEARNER
-from tmc.center.service import MAX_TICKS_UNCOMMITTED
 from tmc.center.station import Station
 from tmc.kernel.config import build, flat
 from tmc.kernel.grid import N_ACTIONS
@@ -86,7 +86,7 @@ class Uav:
         self.pilot = Pilot(world, 0, incarnation, tracks, ObservationBuilder(world), lambda _: Hovers(), planner)
         client.say(m.Hello("uav", 0, incarnation))
         self.begin = client.hear(m.Begin)
-        self._obey(self.pilot.begin(self.begin))
+        self._obey(self.pilot.on_begin(self.begin))
 
     def _obey(self, wish: m.Message | None) -> None:
         if wish is not None:

@@ -12,7 +12,8 @@ from tmc.kernel.config import JournalConfig
 from tmc.record import compare, schemas
 from tmc.record.channels import uav_topic
 from tmc.record.errors import RecordError
-from tmc.record.reader import read, run_files
+from tmc.record.reader import read
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 
 Change = Callable[[str, Any], Iterator[Any]]

@@ -22,7 +22,8 @@ from tmc.kernel.world import World
 from tmc.record import schemas
 from tmc.record.errors import RecordError
 from tmc.record.merge import NAME, merge
-from tmc.record.reader import Log, run_files
+from tmc.record.reader import Log
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 
 T, N = 30, 3
@@ -119,7 +120,7 @@ def test_a_prefix_goes_before_each_topic(flown: Path, tmp_path: Path) -> None:
         path = merge(files, tmp_path / "out.mcap", prefix).path
         assert {row[1] for row in of_merged(path)} == {f"/A{row[1]}" for row in of_source(files)}
     for bad in ("a b", "a//b", "é", "a.b"):
-        with pytest.raises(RecordError, match="is no part of a topic"):
+        with pytest.raises(RecordError, match="is not part of a topic"):
             merge(files, tmp_path / "bad.mcap", bad)
     assert not (tmp_path / "bad.mcap").exists()
 
@@ -206,5 +207,5 @@ def test_the_command(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "tmc.mcap").write_bytes(next(iter(run_files(flown).values())).read_bytes()[:-50])
     assert cli.main(["log", "merge", str(tmp_path)]) == 1
     said = capsys.readouterr()
-    assert said.err.startswith("overfly: this is not all of it: tmc.mcap: ") and (tmp_path / "merged.mcap").is_file()
+    assert said.err.startswith("overfly: the output is incomplete: tmc.mcap: ") and (tmp_path / "merged.mcap").is_file()
     assert cli.main(["log", "merge", str(tmp_path / "nowhere")]) == 2

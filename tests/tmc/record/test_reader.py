@@ -11,7 +11,8 @@ from mcap.writer import Writer
 from tmc.kernel.config import JournalConfig
 from tmc.record import channels, schemas
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, info, read, run_files
+from tmc.record.reader import Log, info, read
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 
 TICKS = 12

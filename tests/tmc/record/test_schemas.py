@@ -1,4 +1,4 @@
-"""One truth in three places: the table of types, overfly.proto, and docs/log-format.md agree."""
+"""One truth in three places: the table of types, overfly.proto, and docs/reference/log-format.md agree."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from tmc.record import channels, schemas
 from tmc.record.errors import RecordError
 
 PROTO = Path(tmc.record.__file__).with_name("overfly.proto")
-DOC = Path(tmc.record.__file__).parents[2] / "docs" / "log-format.md"
+DOC = Path(tmc.record.__file__).parents[2] / "docs" / "reference" / "log-format.md"
 
 
 def parse(text):

@@ -13,7 +13,8 @@ import pytest
 from tmc.kernel.config import JournalConfig
 from tmc.record import builders, schemas
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, read, run_files
+from tmc.record.reader import Log, read
+from tmc.record.run_folder import run_files
 from tmc.record.writer import LogWriter
 
 LAZY = JournalConfig(flush_interval=60.0)

@@ -1,4 +1,4 @@
-"""The TMC's journal as evidence, episode by episode: what it says, in the order in which it says so, and unjudged."""
+"""Read the TMC's journal episode by episode, in its order, without checking it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from tmc.record import builders
 from tmc.record.reader import LogMessage
 
 UNKNOWN = -1
-"""In arrays by tick and UAV: no record tells."""
+"""In arrays by tick and UAV: no record holds the value."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """One flight record, less its arrays.
+    """One flight record without its arrays.
 
-    `given`: the version of the map that its UAV was given: at its last exchange, or before the episode.
+    `version`: of the map in the record. `given`: of the map that the UAV got last, at an exchange or
+    before the episode.
     """
 
     uav: int
@@ -34,8 +35,11 @@ class Record:
 
 @dataclass
 class Sync:
-    """One exchange. `reported`: the tick of each UAV's last record before it; `lost`: the UAVs that were lost by then;
-    `last_visit`: the map logged with it."""
+    """One exchange.
+
+    `reported`: tick of each UAV's last record before it. `lost`: the UAVs that were lost by then. `last_visit`: the map
+    that was logged with it, shape (K,), ticks.
+    """
 
     tick: int
     version: int
@@ -48,7 +52,7 @@ class Sync:
 
 @dataclass(frozen=True)
 class Metrics:
-    """One overfly.TeamMetrics: values from tick `first` on; steps of all UAVs so far."""
+    """One overfly.TeamMetrics: values from tick `first` on, and steps of all UAVs so far."""
 
     first: int
     steps: int
@@ -58,23 +62,26 @@ class Metrics:
 
 @dataclass
 class Before:
-    """What the episodes before have come to: next sequence by UAV, newest version, number."""
+    """The state after the episodes before: next sequence number by UAV, newest map version, number of the last one."""
 
     sequence: dict[int, int] = field(default_factory=dict)
     version: int = 0
     number: int = 0
 
     def copy(self) -> Before:
+        """Return a copy that can change without this one."""
         return Before(dict(self.sequence), self.version, self.number)
 
 
 class EpisodeLog:
-    """All that the journal says of one episode; T ticks, N UAVs, as the config has them.
+    """The content of the journal for one episode; T ticks and N UAVs by the config.
 
-    `cells`, `actions`, `blocks`: shape (T + 1, N), int64, UNKNOWN where no record tells; `own`: the rewards in records,
-    shape (T + 1, N), float64, NaN there. A move is found at the tick at which it ends. `seen`: by UAV, the ticks and
-    cells of its sightings. `lost`: UAV, and the tick of its last record, as told and as it was then. `anomalies`: what
-    makes no sense: (tick, UAV, why).
+    `cells`, `actions`, `blocks`: shape (T + 1, N), int64; UNKNOWN where no record holds the value.
+    `own`: the rewards in the records, shape (T + 1, N), float64; NaN where no record holds one.
+    A move is stored at the tick at which it ends.
+    `seen`: by UAV, the ticks and cells of its sightings.
+    `lost`: (UAV, tick of its last record as logged, tick of its last record in the journal).
+    `anomalies`: messages that cannot be right: (tick, UAV, why).
     """
 
     def __init__(self, world: World, number: int, before: Before) -> None:
@@ -94,40 +101,40 @@ class EpisodeLog:
         self.anomalies: list[tuple[int | None, int | None, str]] = []
         self.reported = [-1] * self.N
         self.last = True
-        """Nothing follows in the journal: it may not be finished."""
+        """True when no episode follows in the journal: then this one may not be finished."""
 
     @property
     def ended(self) -> bool:
-        """The TMC said that the episode was over."""
+        """True when the TMC logged the end of the episode."""
         return bool(self.ends)
 
-    def settled(self) -> int:
-        """The last tick of which the journal tells the uncertainty; -1 when of none."""
+    def last_final(self) -> int:
+        """Return the last tick whose uncertainty is in the journal; -1 when there is none."""
         return max((m.first + len(m.uncertainty) - 1 for m in self.metrics), default=-1)
 
 
-class Gathering:
-    """Sorts the messages of a journal by episode."""
+class EpisodeCollector:
+    """Sort the messages of a journal by episode."""
 
     def __init__(self, world: World) -> None:
         self.world, self.before = world, Before()
         self.episode: EpisodeLog | None = None
 
     def episodes(self, entries: Iterable[LogMessage]) -> Iterator[EpisodeLog]:
-        """One after the other, as soon as the next one begins."""
+        """Yield the episodes, each as soon as the next one begins."""
         for entry in entries:
             name = entry.message.DESCRIPTOR.full_name
-            if name in _TAKERS:
+            if name in _HANDLERS:
                 done = self._turn(entry.message.episode) if name != "foxglove.Grid" else None
                 if done is not None:
                     yield done
                 if self.episode is not None:
-                    _TAKERS[name](self, self.episode, entry.message)
+                    _HANDLERS[name](self, self.episode, entry.message)
         if self.episode is not None:
             yield self.episode
 
     def _turn(self, number: int) -> EpisodeLog | None:
-        """Turn to the episode of a message; returns the one that is over with that."""
+        """Switch to the episode of a message; return the one that is complete by that, or None."""
         done = self.episode
         if done is not None and number <= done.number:
             if number < done.number:
@@ -145,12 +152,12 @@ class Gathering:
         if m.uav < e.N:
             e.lost.append((m.uav, m.tick, e.reported[m.uav]))
         else:
-            e.anomalies.append((None, m.uav, f"it is lost, and there is none of that number in a team of {e.N}"))
+            e.anomalies.append((None, m.uav, f"it is lost, but a team of {e.N} has no UAV of this number"))
 
     def _record(self, e: EpisodeLog, m: Any) -> None:
-        anomalies = misfit(e, m)
-        if anomalies:
-            e.anomalies.append((m.tick, m.uav, anomalies))
+        why = misfit(e, m)
+        if why:
+            e.anomalies.append((m.tick, m.uav, why))
             return
         before, i = self.before, m.uav
         answered = next((s.version for s in reversed(e.syncs) if i in s.uavs), e.before.version)
@@ -171,7 +178,7 @@ class Gathering:
 
     def _grid(self, e: EpisodeLog, m: Any) -> None:
         if not e.syncs or e.syncs[-1].last_visit is not None:
-            e.anomalies.append((None, None, "a map stands behind no exchange"))
+            e.anomalies.append((None, None, "a map does not follow an exchange"))
             return
         grid = self.world.grid
         strides = (m.column_count, m.row_stride) == (grid.cols, grid.cols * m.cell_stride)
@@ -193,12 +200,12 @@ class Gathering:
 
 
 def misfit(e: EpisodeLog, m: Any) -> str:
-    """Why a flight record cannot be put where it says; empty when it can."""
+    """Return why a flight record does not fit the episode; empty when it does."""
     moves, size = m.tick - max(m.first, 1) + 1, e.world.grid.size
     if m.uav >= e.N:
         return f"there is no UAV {m.uav} in a team of {e.N}"
     if not m.first <= m.tick <= e.T:
-        return f"ticks {m.first}..{m.tick} are none of an episode of {e.T}"
+        return f"ticks {m.first}..{m.tick} do not lie in an episode of {e.T} ticks"
     valued = bool(e.world.config.replay.priority_exponent) and e.world.config.team.controller == "policy"
     lengths = [len(m.cells), len(m.actions), len(m.blocks), len(m.rewards), len(m.seen_tick), len(m.values)]
     if lengths != [m.tick - m.first + 1, moves, moves, moves, len(m.seen_cell), 2 * moves * valued]:
@@ -210,12 +217,12 @@ def misfit(e: EpisodeLog, m: Any) -> str:
     return ""
 
 
-_TAKERS: dict[str, Callable[[Gathering, EpisodeLog, Any], None]] = {
-    "overfly.FlightRecord": Gathering._record,
-    "overfly.Lost": Gathering._lost,
-    "overfly.Sync": Gathering._sync,
-    "foxglove.Grid": Gathering._grid,
-    "overfly.TeamMetrics": Gathering._metrics,
-    "overfly.Events": Gathering._events,
-    "overfly.Episode": Gathering._episode,
+_HANDLERS: dict[str, Callable[[EpisodeCollector, EpisodeLog, Any], None]] = {
+    "overfly.FlightRecord": EpisodeCollector._record,
+    "overfly.Lost": EpisodeCollector._lost,
+    "overfly.Sync": EpisodeCollector._sync,
+    "foxglove.Grid": EpisodeCollector._grid,
+    "overfly.TeamMetrics": EpisodeCollector._metrics,
+    "overfly.Events": EpisodeCollector._events,
+    "overfly.Episode": EpisodeCollector._episode,
 }

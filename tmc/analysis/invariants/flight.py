@@ -1,4 +1,4 @@
-"""Invariants of what the UAVs reported: all of it is there, it can be flown, and they saw what was there."""
+"""Invariants of flight records: they are complete, their moves are possible, and their sightings are right."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmc.analysis.invariants.episode_log import UNKNOWN, EpisodeLog
-from tmc.analysis.invariants.result import InvariantResult, first_violation, places
+from tmc.analysis.invariants.result import InvariantResult, first_violation, where_first
 from tmc.kernel.grid import ACTIONS, STAY
 from tmc.kernel.reward import Block
 
@@ -18,7 +18,7 @@ Fault = tuple[int | None, int | None, str]
 
 
 def episodes(e: EpisodeLog) -> InvariantResult:
-    """Episodes follow one another from 1, each begun and, but for the last, ended once; nothing anomalies in them."""
+    """Check that episodes are numbered from 1, begun once and, except the last, ended once, without anomalies."""
     faults: list[Fault] = list(e.anomalies)
     if e.number != e.before.number + 1:
         faults.append((None, None, f"it follows episode {e.before.number}"))
@@ -26,7 +26,9 @@ def episodes(e: EpisodeLog) -> InvariantResult:
         faults.append((None, None, f"{len(e.begins)} different messages begin it"))
     if len(e.ends) > 1 or not (e.ends or e.last):
         faults.append((None, None, f"{len(e.ends)} messages end it"))
-    faults += [(None, None, "its begin has sums of what was not flown yet") for m in e.begins if not _fresh(e, m)]
+    faults += [
+        (None, None, "its begin has totals of moves that were not flown yet") for m in e.begins if not _fresh(e, m)
+    ]
     return first_violation(e, len(e.begins) + len(e.ends), faults)
 
 
@@ -36,31 +38,31 @@ def _fresh(e: EpisodeLog, m: Any) -> bool:
 
 
 def starts(e: EpisodeLog) -> InvariantResult:
-    """The cells at tick 0, and those of the begin of the episode, are the draws of the seed."""
+    """Check that the cells at tick 0, and those logged at the begin, are the draws of the seed."""
     drawn = e.world.starts(e.number)
-    told = [list(m.starts) for m in (*e.begins, *e.ends)]
+    logged = [list(m.starts) for m in (*e.begins, *e.ends)]
     faults: list[Fault] = [
-        (0, None, f"its starts are {cells}, the seed draws {drawn}") for cells in told if cells != drawn
+        (0, None, f"its starts are {cells}, the seed draws {drawn}") for cells in logged if cells != drawn
     ]
     here = e.cells[0] != UNKNOWN
     wrong = np.flatnonzero(here & (e.cells[0] != drawn))
     faults += [(0, int(i), f"it starts on cell {e.cells[0, i]}, the seed draws {drawn[i]}") for i in wrong]
-    return first_violation(e, int(here.sum()) + len(told), faults)
+    return first_violation(e, int(here.sum()) + len(logged), faults)
 
 
 def sequence(e: EpisodeLog) -> InvariantResult:
-    """The numbers of a UAV's records go up by one, over all episodes."""
+    """Check that the numbers of a UAV's records go up by one, over all episodes."""
     following, faults = dict(e.before.sequence), []
     for r in e.records:
         wanted = following.get(r.uav, 0)
         if r.sequence != wanted:
-            faults.append((r.tick, r.uav, f"record {r.sequence} stands where {wanted} is next"))
+            faults.append((r.tick, r.uav, f"record {r.sequence} follows where {wanted} is next"))
         following[r.uav] = r.sequence + 1
     return first_violation(e, len(e.records), faults)
 
 
 def ticks(e: EpisodeLog) -> InvariantResult:
-    """A UAV's records follow one another without a tick between or twice."""
+    """Check that a UAV's records cover each tick once."""
     reported, faults = [-1] * e.N, []
     for r in e.records:
         if r.first != reported[r.uav] + 1:
@@ -72,7 +74,7 @@ def ticks(e: EpisodeLog) -> InvariantResult:
 
 
 def cadence(e: EpisodeLog) -> InvariantResult:
-    """Every record ends at the first tick at which its UAV is due, and holds no such tick before."""
+    """Check that every record ends at the first tick at which its UAV is due."""
     config = e.world.config
     faults: list[Fault] = []
     for r in e.records:
@@ -83,46 +85,48 @@ def cadence(e: EpisodeLog) -> InvariantResult:
 
 
 def lost(e: EpisodeLog) -> InvariantResult:
-    """A UAV is lost once, after its last record; and whoever's records do not reach the episode's end is lost."""
+    """Check that a UAV is lost once, after its last record, and that a UAV whose records end early is lost."""
     faults: list[Fault] = []
-    told = [i for i, *_ in e.lost]
+    logged = [i for i, *_ in e.lost]
     for i, tick, reported in e.lost:
         if tick != reported or e.reported[i] != reported:
             faults.append((tick, i, f"it is lost after tick {tick}; its records end at tick {e.reported[i]}"))
-        if told.count(i) > 1:
+        if logged.count(i) > 1:
             faults.append((tick, i, "it is lost twice"))
-    missing = [i for i in range(e.N) if e.reported[i] < e.T and i not in told]
-    faults += [(e.reported[i], i, "its records end here, and it was not lost") for i in missing if e.ended]
+    missing = [i for i in range(e.N) if e.reported[i] < e.T and i not in logged]
+    faults += [(e.reported[i], i, "its records end here, but it was not lost") for i in missing if e.ended]
     return first_violation(e, e.N, faults)
 
 
 def moves(e: EpisodeLog) -> InvariantResult:
-    """Each cell follows from the one before by the action, or is the same where the move was blocked; edges, obstacles
-    and no-fly cells block, and nothing else but a UAV does."""
+    """Check that each cell follows from the one before by the action, or is the same where the move was blocked.
+
+    Edges, obstacles and no-fly cells block; otherwise only a UAV does.
+    """
     before, after, action, block = e.cells[:-1], e.cells[1:], e.actions[1:], e.blocks[1:]
     known = (before != UNKNOWN) & (after != UNKNOWN)
     target, static = _static(e, before, action)
     expected = np.where(block == Block.NONE, target, before)
     jump = known & (expected != after)
     untrue = known & (static != np.where(block == Block.UAV, Block.NONE, block))
-    held_by_itself = known & (block == Block.UAV) & (action == STAY)
+    stay_blocked = known & (block == Block.UAV) & (action == STAY)
     on_obstacle = (e.cells != UNKNOWN) & e.world.map.blocked[e.cells]
-    faults: list[Fault] = [(t + 1, i, f"it goes from cell {before[t, i]} to {after[t, i]} by {_said(e, t, i)}")
-                           for t, i in places(jump)]  # fmt: skip
-    faults += [(t + 1, i, f"what blocks the map from cell {before[t, i]} is not what {_said(e, t, i)} tells")
-               for t, i in places(untrue)]  # fmt: skip
-    faults += [(t + 1, i, "another UAV is said to keep it from staying") for t, i in places(held_by_itself)]
-    faults += [(t, i, f"it stands on the obstacle of cell {e.cells[t, i]}") for t, i in places(on_obstacle)]
+    faults: list[Fault] = [(t + 1, i, f"it goes from cell {before[t, i]} to {after[t, i]} by {_move(e, t, i)}")
+                           for t, i in where_first(jump)]  # fmt: skip
+    faults += [(t + 1, i, f"by the map, its move from cell {before[t, i]} is not {_move(e, t, i)}")
+               for t, i in where_first(untrue)]  # fmt: skip
+    faults += [(t + 1, i, "another UAV blocks it from staying on its cell") for t, i in where_first(stay_blocked)]
+    faults += [(t, i, f"it stands on the obstacle of cell {e.cells[t, i]}") for t, i in where_first(on_obstacle)]
     return first_violation(e, int(known.sum()), faults)
 
 
-def _said(e: EpisodeLog, t: int, i: int) -> str:
+def _move(e: EpisodeLog, t: int, i: int) -> str:
     action, block = e.actions[t + 1, i], Block(max(e.blocks[t + 1, i], 0))
     return f"action {ACTIONS[action][0]}" + (f", blocked by {block.name.lower()}" if block else "")
 
 
 def _static(e: EpisodeLog, before: Ints, action: Ints) -> tuple[Ints, Ints]:
-    """Where the actions lead (UNKNOWN: off the grid), and what the map says of that; by rows and columns."""
+    """Return the target of each action (UNKNOWN: off the grid), and the `Block` of the map; shapes of `before`."""
     grid, steps = e.world.grid, np.array([(dr, dc) for _, dr, dc in ACTIONS])
     rows = before // grid.cols + steps[action, 0]
     cols = before % grid.cols + steps[action, 1]
@@ -133,7 +137,10 @@ def _static(e: EpisodeLog, before: Ints, action: Ints) -> tuple[Ints, Ints]:
 
 
 def blocks(e: EpisodeLog) -> InvariantResult:
-    """A UAV blocks a move just when it holds the target: one of a lower id at the new tick, a higher at the old."""
+    """Check that a UAV blocks a move exactly when it holds the target.
+
+    A UAV with a lower id holds its cell of the new tick, one with a higher id that of the old tick.
+    """
     before, action, block = e.cells[:-1], e.actions[1:], e.blocks[1:]
     target, static = _static(e, before, action)
     free = (before != UNKNOWN) & (e.cells[1:] != UNKNOWN) & (static == Block.NONE) & (action != STAY)
@@ -143,15 +150,15 @@ def blocks(e: EpisodeLog) -> InvariantResult:
         held = (others == target[:, [i]]).any(axis=1)
         unsure = (others == UNKNOWN).any(axis=1)  # a lost UAV may have held it
         by_uav = block[:, i] == Block.UAV
-        for bad, what in ((~held & ~unsure & by_uav, "nobody holds"), (held & ~by_uav, "another UAV holds")):
+        for bad, what in ((~held & ~unsure & by_uav, "no UAV holds"), (held & ~by_uav, "another UAV holds")):
             wrong = np.flatnonzero(bad & free[:, i])
-            said = "blocked by a UAV" if what == "nobody holds" else "not blocked"
-            faults += [(int(t) + 1, i, f"{said}, but {what} cell {target[t, i]}") for t in wrong[:1]]
+            logged = "blocked by a UAV" if what == "no UAV holds" else "not blocked"
+            faults += [(int(t) + 1, i, f"{logged}, but {what} cell {target[t, i]}") for t in wrong[:1]]
     return first_violation(e, int(free.sum()), faults)
 
 
 def separation(e: EpisodeLog) -> InvariantResult:
-    """No two UAVs are on one cell at one tick."""
+    """Check that no two UAVs are on one cell at one tick."""
     order = np.sort(e.cells, axis=1)
     shared = (np.diff(order, axis=1) == 0) & (order[:, 1:] != UNKNOWN)
     faults: list[Fault] = []
@@ -163,7 +170,7 @@ def separation(e: EpisodeLog) -> InvariantResult:
 
 
 def sightings(e: EpisodeLog) -> InvariantResult:
-    """A UAV saw those that were within its sensing range, tick by tick; in scenario I everybody sees everybody."""
+    """Check that a UAV sighted the UAVs within its sensing range, tick by tick; in scenario I, all UAVs."""
     faults: list[Fault] = []
     facts = 0
     for i in range(e.N):
@@ -176,7 +183,7 @@ def sightings(e: EpisodeLog) -> InvariantResult:
 
 
 def _near(e: EpisodeLog, i: int) -> Ints:
-    """(2, S): ticks, and cells of the others within UAV i's range, by tick and id."""
+    """Return ticks and cells of the other UAVs within UAV i's range, by tick and id; shape (2, S)."""
     cols, reach = e.world.grid.cols, e.world.config.team.sensing_range
     dr = e.cells // cols - (e.cells[:, [i]] // cols)
     dc = e.cells % cols - (e.cells[:, [i]] % cols)
@@ -188,10 +195,10 @@ def _near(e: EpisodeLog, i: int) -> Ints:
 
 
 def _unseen(e: EpisodeLog, i: int, seen: Ints, there: Ints) -> Iterator[Fault]:
-    """What differs, tick by tick; where UAVs are lost, one may have been seen of whom no record tells."""
+    """Yield the ticks that differ. A lost UAV may have been sighted where no record holds its cell."""
     for t in np.unique(np.concatenate((seen[0], there[0]))).tolist():
         saw, could = seen[1, seen[0] == t].tolist(), there[1, there[0] == t].tolist()
         gone = int((e.cells[t] == UNKNOWN).sum()) if t <= e.T else 0
         extra = [cell for cell in saw if cell not in could]
         if saw != could and not (len(extra) <= gone and [c for c in saw if c in could] == could):
-            yield t, i, f"it reports UAVs on cells {saw}, on {could} there are some in its range"
+            yield t, i, f"it reports UAVs on cells {saw}, but the UAVs in its range are on {could}"

@@ -1,7 +1,7 @@
-"""What must have been, reckoned from the cells that UAVs reported: apart from the code that the TMC and the UAVs run.
+"""Recompute an episode from the cells that the UAVs reported, independently of the code of TMC and UAVs.
 
-Uncertainty comes from exponentials of ages, not from the kernel's tables; shared with it are the map, the rates and the
-addressed draws. Cells without a record (`UNKNOWN`) belong to UAVs that were lost, or to ticks still to come.
+Uncertainty is computed from exponentials of ages, not from the kernel's tables. Only the map, the rates and the
+addressed draws are shared with the kernel. Cells without a record (`UNKNOWN`) belong to lost UAVs, or to later ticks.
 """
 
 from __future__ import annotations
@@ -20,43 +20,50 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Law:
-    """`cells`: (R,), the monitored ones; `place`: (K,), where a cell stands among them, or -1; the rest: (R,)."""
+class Rates:
+    """Rates of the R monitored cells of K.
+
+    `cells`: (R,), their ids. `index`: (K,), the index of a cell among them, or -1. `alpha`: (R,), event rate, 1/tick.
+    `weight`: (R,), reward per uncertainty.
+    """
 
     cells: Ints
-    place: list[int]
+    index: list[int]
     alpha: Floats
     weight: Floats
 
 
 @cache
-def law_of(world: World) -> Law:
-    """Rates of the monitored cells, and what their uncertainty earns: lambda, or aligned with the team's objective."""
+def rates_of(world: World) -> Rates:
+    """Return the rates of a world. The weight is lambda, or with `reward.aligned` scaled to the team's objective."""
     cells = np.flatnonzero(world.alpha > 0)
-    place = np.full(world.grid.size, -1)
-    place[cells] = np.arange(cells.size)
+    index = np.full(world.grid.size, -1)
+    index[cells] = np.arange(cells.size)
     alpha, config = world.alpha[cells], world.config
     scale = 1 / (1 - config.dqn.gamma * np.exp(-alpha)) if config.reward.aligned else np.ones(cells.size)
-    return Law(cells, place.tolist(), alpha, config.reward.weight * scale)
+    return Rates(cells, index.tolist(), alpha, config.reward.weight * scale)
 
 
 def start_factor(e: EpisodeLog) -> Floats:
-    """(R,): what is left of certainty at t = 0, 1 - u_k(0)."""
+    """Return 1 - u_k(0) of the monitored cells; shape (R,)."""
     factor = e.world.initial_factor(e.number)
-    return np.ones(law_of(e.world).cells.size) if factor is None else factor
+    return np.ones(rates_of(e.world).cells.size) if factor is None else factor
 
 
-def uncertainty(law: Law, start: Floats, last_visit: Ints, t: int) -> Floats:
-    """Eq. (3): (R,) from the ticks of the last visits; `start` counts where there was none since."""
-    return np.asarray(1 - np.where(last_visit == 0, start, 1.0) * np.exp(-law.alpha * (t - last_visit)))
+def uncertainty(rates: Rates, start: Floats, last_visit: Ints, t: int) -> Floats:
+    """Return u_k(t) by eq. (3), from the ticks of the last visits, 0 for none; shape (R,). `start`: 1 - u_k(0)."""
+    return np.asarray(1 - np.where(last_visit == 0, start, 1.0) * np.exp(-rates.alpha * (t - last_visit)))
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The true map over an episode, entry by tick 0..T: sum over cells, rewards (T + 1, N), new events of each tick.
+    """The true map over an episode, by tick 0..T.
 
-    `active`: scenario I, (T + 1, K), the events that are on; `found`: (T + 1, N), uncertainty of the cell that a UAV
-    entered, before the visit.
+    `uncertainty`: (T + 1,), summed over cells.
+    `reward`: (T + 1, N).
+    `found`: (T + 1, N), uncertainty of the cell that a UAV entered, before its visit.
+    `events`: cells of the new events of each tick.
+    `active`: (T + 1, K), True where an event is active; empty in scenario II.
     """
 
     uncertainty: Floats
@@ -67,21 +74,21 @@ class Reference:
 
 
 def truth(e: EpisodeLog) -> Reference:
-    """Fly the episode again over the true map."""
+    """Recompute the true map of an episode."""
     return _truth_1(e) if e.world.config.scenario == 1 else _truth_2(e)
 
 
 def _truth_2(e: EpisodeLog) -> Reference:
-    law, start = law_of(e.world), start_factor(e)
-    last, total, found = np.zeros(law.cells.size, np.int64), np.zeros(e.T + 1), np.zeros((e.T + 1, e.N))
-    place = np.append(law.place, -1)
+    rates, start = rates_of(e.world), start_factor(e)
+    last, total, found = np.zeros(rates.cells.size, np.int64), np.zeros(e.T + 1), np.zeros((e.T + 1, e.N))
+    index = np.append(rates.index, -1)
     for t in range(e.T + 1):
-        at = place[e.cells[t]]  # UNKNOWN takes the last entry
+        at = index[e.cells[t]]  # UNKNOWN takes the last entry
         monitored = at >= 0
         visited = at[monitored]
-        found[t, monitored] = uncertainty(law, start, last, t)[visited]
+        found[t, monitored] = uncertainty(rates, start, last, t)[visited]
         last[visited] = t
-        total[t] = uncertainty(law, start, last, t).sum()
+        total[t] = uncertainty(rates, start, last, t).sum()
     return Reference(total, rewards(e, found), found, [], np.zeros((0, 0), bool))
 
 
@@ -103,9 +110,9 @@ def _truth_1(e: EpisodeLog) -> Reference:
 
 
 def rewards(e: EpisodeLog, found: Floats) -> Floats:
-    """(T + 1, N): eq. (13) by the true map, or with the UAVs' own reckoning where the config says so."""
-    rules, place = e.world.config.reward, law_of(e.world).place
-    weight = [*law_of(e.world).weight.tolist(), 0.0]
+    """Return the rewards by eq. (13), shape (T + 1, N): by the true map, or the UAVs' own where the config says so."""
+    rules, index = e.world.config.reward, rates_of(e.world).index
+    weight = [*rates_of(e.world).weight.tolist(), 0.0]
     out, own_visits, team_visits = np.zeros((e.T + 1, e.N)), [set[int]() for _ in range(e.N)], set[int]()
     cells, blocks, u = e.cells.tolist(), e.blocks.tolist(), found.tolist()
     for t in range(e.T + 1):
@@ -118,7 +125,7 @@ def rewards(e: EpisodeLog, found: Floats) -> Floats:
             elif rules.uncertainty == "own":
                 out[t, i] = e.own[t, i] + rules.new_cell * (counted - novel)
             else:
-                out[t, i] = rules.new_cell * counted + weight[place[cell]] * u[t][i]
+                out[t, i] = rules.new_cell * counted + weight[index[cell]] * u[t][i]
         for i, cell in here:
             own_visits[i].add(cell)
             team_visits.add(cell)
@@ -126,7 +133,7 @@ def rewards(e: EpisodeLog, found: Floats) -> Floats:
 
 
 def maps_handed_out(e: EpisodeLog) -> list[Ints]:
-    """For each exchange the map that its tick and its UAVs make, (K,): ticks of the last visits that the TMC knows."""
+    """Return for each exchange the map that the TMC must hand out: ticks of the last visits it knows, shape (K,)."""
     believed, known = np.zeros(e.world.grid.size, np.int64), [-1] * e.N
     monitored = e.world.alpha > 0
     maps = []
@@ -141,22 +148,24 @@ def maps_handed_out(e: EpisodeLog) -> list[Ints]:
 
 
 def own_rewards(e: EpisodeLog, i: int, maps: list[Ints], active: NDArray[np.bool_]) -> Floats:
-    """(T + 1,): UAV i's reward by its own map, from where it was, what it saw and the maps that it was given; NaN where
-    it did not move."""
-    config, law, start = e.world.config, law_of(e.world), start_factor(e)
+    """Return UAV i's rewards by its own map, NaN where it did not move; shape (T + 1,).
+
+    Its own map follows from its cells, its sightings and the maps that it was given.
+    """
+    config, rates, start = e.world.config, rates_of(e.world), start_factor(e)
     given = {s.tick: m for s, m in zip(e.syncs, maps, strict=True) if i in s.uavs}
     seen: dict[int, list[int]] = {}
     for tick, cell in zip(*e.seen[i], strict=True):
         seen.setdefault(tick, []).append(cell)
     last, visited, out = np.zeros(e.world.grid.size, np.int64), set[int](), np.full(e.T + 1, np.nan)
-    weight, alpha, certain = law.weight.tolist(), law.alpha.tolist(), start.tolist()
+    weight, alpha, certain = rates.weight.tolist(), rates.alpha.tolist(), start.tolist()
     cells, blocks = e.cells[:, i].tolist(), e.blocks[:, i].tolist()
     for t in range(e.T + 1):
         cell = cells[t]
         if cell == UNKNOWN:
             break
         if t:
-            k, tau, u = law.place[cell], int(last[cell]), 0.0
+            k, tau, u = rates.index[cell], int(last[cell]), 0.0
             if k >= 0 and config.scenario == 1:
                 u = float(active[t - 1, cell])
             elif k >= 0:
@@ -171,22 +180,22 @@ def own_rewards(e: EpisodeLog, i: int, maps: list[Ints], active: NDArray[np.bool
 
 
 def accounts(e: EpisodeLog, found: Floats) -> tuple[Floats, Floats]:
-    """The accounting identity of the log, both sides by cell, (R,): the sum over ticks 1..T of the uncertainty.
+    """Return both sides of the balance of the uncertainty per cell, summed over ticks 1..T; shapes (R,).
 
-    Left: tick by tick, u(t + 1) = 1 - q + q u(t), and 0 at a visit. Right: the sum had nobody come, less what each
-    visit took away, u before it times (1 - q^(T - t + 1)) / (1 - q).
+    Left: tick by tick, u(t + 1) = 1 - q + q u(t), and 0 at a visit. Right: the sum without visits, less what each visit
+    removed, u before it times (1 - q^(T - t + 1)) / (1 - q).
     """
-    law, start = law_of(e.world), start_factor(e)
-    q, place = np.exp(-law.alpha), np.append(law.place, -1)
-    u, left = 1 - start, np.zeros(law.cells.size)
+    rates, start = rates_of(e.world), start_factor(e)
+    q, index = np.exp(-rates.alpha), np.append(rates.index, -1)
+    u, left = 1 - start, np.zeros(rates.cells.size)
     ages = np.arange(1, e.T + 1)
-    right = np.array([e.T - s * np.exp(-a * ages).sum() for s, a in zip(start, law.alpha, strict=True)])
+    right = np.array([e.T - s * np.exp(-a * ages).sum() for s, a in zip(start, rates.alpha, strict=True)])
     for t in range(1, e.T + 1):
-        at = place[e.cells[t]]
+        at = index[e.cells[t]]
         uavs = np.flatnonzero(at >= 0)
         u = 1 - q + q * u
         for k, i in zip(at[uavs].tolist(), uavs.tolist(), strict=True):
-            right[k] -= found[t, i] * -np.expm1(-law.alpha[k] * (e.T - t + 1)) / -np.expm1(-law.alpha[k])
+            right[k] -= found[t, i] * -np.expm1(-rates.alpha[k] * (e.T - t + 1)) / -np.expm1(-rates.alpha[k])
         u[at[uavs]] = 0.0
         left += u
     return left, right

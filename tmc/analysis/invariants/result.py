@@ -1,4 +1,4 @@
-"""What an invariant says of an episode: how many facts it compared, and the first that breaks it."""
+"""The result of an invariant for an episode: the number of facts compared, and the first violation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tmc.analysis.invariants.episode_log import EpisodeLog
 
 @dataclass(frozen=True)
 class Violation:
-    """A fact that cannot be true. `episode`, `tick`, `uav`: where it is, None where that makes no sense."""
+    """A fact that violates an invariant. `episode`, `tick`, `uav`: its position; None where one does not apply."""
 
     episode: int | None
     tick: int | None
@@ -29,24 +29,24 @@ class Violation:
 
 @dataclass(frozen=True)
 class InvariantResult:
-    """Facts compared, and the first violation among them."""
+    """The number of facts compared, and the first violation among them."""
 
     facts: int
     violation: Violation | None = None
 
 
 def first_violation(e: EpisodeLog, facts: int, faults: Iterable[tuple[int | None, int | None, str]]) -> InvariantResult:
-    """The first of the faults (tick, UAV, what), by tick."""
+    """Return the result with the first of the faults (tick, UAV, what), by tick."""
     first = min(faults, key=lambda f: (f[0] is not None, f[0] or 0, f[1] or 0), default=None)
     return InvariantResult(facts, Violation(e.number, *first) if first else None)
 
 
-def places(bad: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """(tick, UAV) of the first tick at which an array by tick and UAV is true; empty when it is nowhere."""
+def where_first(bad: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return (tick, UAV) of each true entry at the first tick that has one; `bad` is by tick and UAV."""
     ticks = np.flatnonzero(bad.any(axis=1))
     return [(int(ticks[0]), int(i)) for i in np.flatnonzero(bad[ticks[0]])] if ticks.size else []
 
 
 def close(a: Any, b: Any, tolerance: float) -> NDArray[np.bool_]:
-    """Equal up to a tolerance, of 1 or of the value where that is larger; nothing is close to NaN."""
+    """Return where |a - b| <= tolerance * max(1, |b|); False for NaN."""
     return np.asarray(np.abs(np.subtract(a, b)) <= tolerance * np.maximum(1.0, np.abs(b)))

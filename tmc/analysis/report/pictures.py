@@ -1,4 +1,4 @@
-"""The way to the pictures: matplotlib without the user's settings for it, and failures that cost a sentence each."""
+"""Draw pictures without the user's settings of matplotlib, and report a failure in one sentence."""
 
 from __future__ import annotations
 
@@ -18,32 +18,30 @@ from tmc.kernel.roadmap import RoadMap
 Made = TypeVar("Made")
 Explain = Callable[[Exception], str]
 ENVIRONMENT = {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
-"""For the import of matplotlib, which fails for some of what a notebook or a shell may have set."""
+"""The environment for the import of matplotlib, which fails for some values that a notebook or a shell may set."""
 
 
 class PictureError(Exception):
-    """A picture cannot be drawn: the reason, without the picture's name."""
+    """A picture cannot be drawn. The text is the reason, without the picture's name."""
 
 
 def draw(
-    flown: RunData,
+    run: RunData,
     summary: Summary,
     episode: int | None,
     baselines: Mapping[str, float],
     tell: Callable[[str], None],
     explain: Explain = str,
 ) -> list[Path]:
-    """Make the pictures of a run; returns the paths of those that could be made.
+    """Draw the pictures of a run; return the paths of those that could be drawn.
 
-    `tell` is given a sentence for each other one.
-
-    `episode`, `baselines`: as in `tmc.analysis.report.figures.pictures`. `explain`: what to do where something
-    cannot be imported; empty for what it does not know.
+    `tell` gets a sentence on each other one. `episode`, `baselines`: as in `tmc.analysis.report.figures.pictures`.
+    `explain`: returns the fix for an import that failed, or an empty text.
     """
     made = []
     try:
         figures = _figures(explain)
-        pictures = _safely(lambda: figures.pictures(flown, summary, episode, baselines))
+        pictures = _safely(lambda: figures.pictures(run, summary, episode, baselines))
         for path, picture in pictures.items():
             try:
                 made.append(_safely(picture))
@@ -55,7 +53,7 @@ def draw(
 
 
 def draw_map(road_map: RoadMap, path: Path, explain: Explain = str) -> None:
-    """Make a picture of a map; PictureError when it cannot be."""
+    """Draw a map; PictureError when that fails."""
     figures = _figures(explain)
     _safely(lambda: figures.map_picture(road_map, path))
 
@@ -64,12 +62,12 @@ def _safely(make: Callable[[], Made]) -> Made:
     with _quiet():
         try:
             return make()
-        except Exception as error:  # a library, fonts, a disk, odd data: whatever it is, the work was done
+        except Exception as error:  # library, fonts, disk or data: the run itself is complete
             raise PictureError(_reason(error)) from None
 
 
 def _figures(explain: Explain) -> Any:
-    """The module that draws; half a second, and an extra."""
+    """Import the module that draws. It takes half a second, and needs an extra."""
     with _quiet(), _own_environment():
         try:
             return importlib.import_module("tmc.analysis.report.figures")
@@ -78,14 +76,14 @@ def _figures(explain: Explain) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """On one line, which is not what every library has."""
+    """Return the reason on one line."""
     text = error.strerror if isinstance(error, OSError) else str(error)
     return " ".join((text or type(error).__name__).split())
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without matplotlib's notes on fonts, caches and other people's settings."""
+    """Silence matplotlib's notes on fonts, caches and settings."""
     log = logging.getLogger("matplotlib")
     before = log.level
     log.setLevel(logging.CRITICAL)
@@ -99,7 +97,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _own_environment() -> Iterator[None]:
-    """ENVIRONMENT, in a folder without settings: matplotlib reads those of the current one first."""
+    """Set ENVIRONMENT, and a working folder without settings: matplotlib first reads those of the current folder."""
     before = {name: os.environ.get(name) for name in ENVIRONMENT}
     here = None
     os.environ.update(ENVIRONMENT)

@@ -1,4 +1,4 @@
-"""How pictures look: colours that everybody can tell apart, and figures without pyplot's global state."""
+"""The look of pictures, and figures without pyplot's global state."""
 
 from __future__ import annotations
 
@@ -14,30 +14,25 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from tmc.kernel.text import printable
+from tmc.record.disk import write_atomically
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILION, PURPLE = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
-"""Okabe and Ito's palette."""
-UAV_COLOURS = (VERMILION, SKY, GREEN, PURPLE, BLACK, ORANGE, BLUE, YELLOW, "#882255", "#999933")
-"""By UAV, two of Tol's added; over again after ten: the marker's shape then differs."""
 UAV_MARKERS = ("o", "s", "^", "D")
 GREY, LIGHT, ROAD, BLOCKED = "#666666", "#F4F4F4", "#8C8C8C", "#3B3B3B"
 UNCERTAINTY = "cividis"
 DPI = 130
-LONGEST = 60
-"""Characters of a name in a title or a legend."""
+MAX_NAME_CHARS = 60
+"""Length of a name in a title or a legend."""
 OURS = {"text.parse_math": False}
-"""matplotlib's settings beside its defaults: a map may be called `$x$`, and that is its name."""
+"""Settings that differ from matplotlib's defaults: the name of a map may hold a `$`."""
 BACKENDS = ("backend", "backend_fallback")
-"""Settings of windows, of which there are none."""
+"""Settings of windows, which are not used."""
 
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Draw by matplotlib's defaults and OURS, whatever a user's matplotlibrc or program has set, and warn of nothing.
+    """Draw with matplotlib's defaults and OURS, without the user's settings and without warnings.
 
-    Also a decorator; what was set before is set again at the end.
+    Also a decorator. The former settings are restored at the end.
     """
     defaults = {name: value for name, value in dict.items(matplotlib.rcParamsDefault) if name not in BACKENDS}
     with warnings.catch_warnings():
@@ -47,30 +42,30 @@ def own_settings() -> Iterator[None]:
 
 
 def name(text: str) -> str:
-    """A user's name for something, as it is drawn: short, and on one line; `_x` would be left out of a legend."""
+    """Return a user's name as it is drawn: short, on one line, and not `_x`, which legends leave out."""
     words = printable(text)
-    words = words if len(words) <= LONGEST else words[: LONGEST - 3] + "..."
+    words = words if len(words) <= MAX_NAME_CHARS else words[: MAX_NAME_CHARS - 3] + "..."
     return f" {words}" if words.startswith("_") else words
 
 
 def figure(width: float, height: float) -> Figure:
-    """A figure of so many inches that lays itself out; Agg draws it when it is saved as PNG."""
+    """Return a figure of this size, inches, with automatic layout; Agg draws it."""
     made = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(made)
     return made
 
 
 def plain(axes: Any) -> None:
-    """No frame on the right and at the top, a light grid behind."""
+    """Remove the frame on the right and at the top; draw a light grid behind."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
 
 
 def save(made: Figure, path: Path) -> Path:
-    """Write a PNG, its folder too; returns `path`."""
+    """Write a PNG whole or not at all, and make its folder; return `path`. Raises OSError."""
     drawn = io.BytesIO()
     made.savefig(drawn, format="png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(drawn.getvalue())
+    write_atomically(path, drawn.getvalue(), sync=False)
     return path

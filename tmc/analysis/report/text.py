@@ -1,4 +1,4 @@
-"""The summary as text: at most 24 lines of 80 columns, plain words, numbers with their units; then where things lie."""
+"""Write the summary as text: at most 24 lines of 80 columns, numbers with their units, then the paths."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from pathlib import Path
 from tmc.analysis.summary import EpisodeFacts, Summary
 from tmc.kernel.text import printable
 
-WIDTH, LINES = 80, 24
-_LABEL = 11
+WIDTH_CHARS, HEIGHT_LINES = 80, 24
+_LABEL_CHARS = 11
 
 
 def text(s: Summary, reserve: int = 0, *, kept: bool = True) -> str:
-    """The report, without a newline at its end.
+    """Return the report, without a newline at its end.
 
-    `reserve`: lines of the screen for what will be said after it. `kept`: the summary is in the run folder too.
+    `reserve`: lines of the screen to leave for text after it. `kept`: the summary is in the run folder too.
     """
     paths = list(_paths(s, kept=kept))
     lines = [*_mission(s), "", *_uncertainty(s), "", *_facts(s)]
-    notes = _notes(s, LINES - len(lines) - len(paths) - reserve)
+    notes = _notes(s, HEIGHT_LINES - len(lines) - len(paths) - reserve)
     return "\n".join(map(printable, [*lines, *notes, *paths]))
 
 
 def pictures(paths: Sequence[Path]) -> str:
-    """The line that says where the pictures lie, all of one folder."""
-    return printable(f"{'Pictures':<{_LABEL}}{paths[0].parent}/{{{','.join(sorted(p.name for p in paths))}}}")
+    """Return the line with the paths of the pictures, all of one folder."""
+    return printable(f"{'Pictures':<{_LABEL_CHARS}}{paths[0].parent}/{{{','.join(sorted(p.name for p in paths))}}}")
 
 
 def _row(label: str, words: str) -> str:
-    """A label and its text, cut where the screen ends."""
-    return f"{label:<{_LABEL}}" + textwrap.shorten(words, WIDTH - _LABEL, placeholder=" ...")
+    """Return a label and its text, cut at the width of the screen."""
+    return f"{label:<{_LABEL_CHARS}}" + textwrap.shorten(words, WIDTH_CHARS - _LABEL_CHARS, placeholder=" ...")
 
 
 def _mission(s: Summary) -> Iterator[str]:
     m = s.mission
-    who = " in training" if m.learning else f", {m.who}"
-    yield _row("Team", f"{_count(m.uavs, 'UAV')}{who}; scenario {m.scenario}, T_u = {_count(m.T_u, 'tick')}")
+    controller = " in training" if m.learning else f", {m.controller}"
+    yield _row("Team", f"{_count(m.uavs, 'UAV')}{controller}; scenario {m.scenario}, T_u = {_count(m.T_u, 'tick')}")
     yield _row("Map", f"{m.map} ({m.roads}, {m.obstacles}): {m.road_cells:,} road cells of {m.cell_m:g} m")
     yield _row(
         "Episodes", f"{m.episodes_flown:,} of {m.episodes_planned:,}, of {m.ticks:,} ticks of 60 s; seed {m.seed}"
@@ -45,10 +45,10 @@ def _mission(s: Summary) -> Iterator[str]:
 
 
 def _uncertainty(s: Summary) -> Iterator[str]:
-    """A table: eq. (6) of a few episodes, and of the bound."""
+    """Yield a table: eq. (6) of some episodes, and of the bound."""
     cell = "road cell" if s.mission.monitored_cells == s.mission.road_cells else "cell"
     what = "Active events" if s.mission.scenario == 1 else "Uncertainty"
-    yield f"{what + ', mean of ticks':<34}{'a ' + cell:>14}{'all cells':>14}{'x bound':>12}"
+    yield f"{what + ', mean over ticks':<34}{'per ' + cell:>14}{'all cells':>14}{'x bound':>12}"
     for label, f in _chosen(s):
         yield _table_row(label, f.per_cell, f.uncertainty, f.times_bound)
     if s.mean.episodes > 1:
@@ -63,7 +63,7 @@ def _uncertainty(s: Summary) -> Iterator[str]:
 
 
 def _chosen(s: Summary) -> list[tuple[str, EpisodeFacts]]:
-    """First, best and last episode, each once."""
+    """Return first, best and last episode, each once."""
     if s.first == s.last:
         return [(f"episode {s.first.episode}", s.first)]
     rows = [("first", s.first), ("best", s.best), ("last", s.last)]
@@ -82,18 +82,18 @@ def _facts(s: Summary) -> Iterator[str]:
     last, p, h = s.last, s.pace, s.health
     which = f"episode {last.episode}"
     earlier = "" if s.first == last else f", {s.first.reward:.3f} in episode {s.first.episode}"
-    yield _row("Reward", f"{last.reward:.3f} a UAV a tick in {which}{earlier}")
+    yield _row("Reward", f"{last.reward:.3f} per UAV per tick in {which}{earlier}")
     causes = f"UAVs {s.blocked_uav:,}, obstacles {s.blocked_obstacle:,}, edge {s.blocked_grid:,}"
     yield _row("Blocked", f"{s.blocked_share:.2%} of {s.moves:,} moves: {causes}")
     roads = f"{last.on_road:.1%} of ticks over road, {last.coverage:.1%} of road cells visited"
     yield _row("Roads", f"{roads} in {which}")
     if last.events_appeared is not None:
         yield _row("Events", f"{_events(last)} in {which}")
-    took = f" in {_clock(p.seconds)}, {p.ticks_per_second:,.0f} a second" if p.seconds else ""
+    took = f" in {_clock(p.seconds)}, {p.ticks_per_second:,.0f} per second" if p.seconds else ""
     yield _row("Pace", f"{p.ticks:,} ticks{took}")
     if s.mission.learning:
         loss = "" if p.loss is None else f"; last loss {p.loss:.3g}"
-        yield _row("Learning", f"{p.updates:,} updates, {p.updates_per_second:,.0f} a second{loss}")
+        yield _row("Learning", f"{p.updates:,} updates, {p.updates_per_second:,.0f} per second{loss}")
     yield _row("Processes", _processes(s))
     yield _row("Log", f"{_size(h.log_bytes)} in {_count(len(h.log_files), 'file')}" + ("" if h.notes else ", intact"))
 
@@ -115,20 +115,22 @@ def _processes(s: Summary) -> str:
 
 
 def _notes(s: Summary, room: int) -> list[str]:
-    """What is not as it should be, on so many lines; the rest of a long list is in summary.json."""
+    """Return what is wrong, on at most `room` lines; the rest of a long list is in summary.json."""
     cut = [f"episode {f.episode} breaks off at tick {f.ticks:,}" for f in s.episodes if not f.complete]
-    indent = " " * _LABEL
-    first = f"{'Note':<{_LABEL}}"
-    notes = (textwrap.wrap(n, WIDTH, initial_indent=first, subsequent_indent=indent) for n in (*cut, *s.health.notes))
+    indent = " " * _LABEL_CHARS
+    first = f"{'Note':<{_LABEL_CHARS}}"
+    notes = (
+        textwrap.wrap(n, WIDTH_CHARS, initial_indent=first, subsequent_indent=indent) for n in (*cut, *s.health.notes)
+    )
     lines = [line for note in notes for line in note]
     return lines if len(lines) <= room else [*lines[: max(room - 1, 0)], f"{indent}and more: see summary.json"]
 
 
 def _paths(s: Summary, *, kept: bool) -> Iterator[str]:
     """Paths stay whole, so that they can be copied, even where they are long."""
-    yield f"{'Logs':<{_LABEL}}{s.run}/*.mcap*"
+    yield f"{'Logs':<{_LABEL_CHARS}}{s.run}/*.mcap*"
     if kept:
-        yield f"{'Summary':<{_LABEL}}{s.run}/summary.json"
+        yield f"{'Summary':<{_LABEL_CHARS}}{s.run}/summary.json"
 
 
 def _count(n: int, thing: str) -> str:

@@ -1,7 +1,7 @@
-"""The layout in which Lichtblick and Foxglove show a replay file: `layout.json` is the template, filled in here.
+"""Fill in `layout.json`, the template of the layout in which Lichtblick and Foxglove show a replay file.
 
-In the template an entry with `<id>` stands for one of each UAV, with its `<colour>`; `<first>` is true of UAV 0 only.
-`<x>`, `<y>` and `<height>` are the centre and the height of the view in metres, `<cell>` is the width of a cell.
+In the template, an entry with `<id>` is repeated per UAV, with its `<colour>`; `<first>` is true for UAV 0 only.
+`<x>`, `<y>` and `<height>` are the centre and the height of the view, `<cell>` is the width of a cell; all in metres.
 """
 
 from __future__ import annotations
@@ -13,14 +13,17 @@ from typing import Any
 
 FILE = "layout.json"
 """The template's name in this package, and that of the attachment in a replay file."""
-MARGIN = 1.1
-"""Height of the view over that of the map."""
+VIEW_HEIGHT_FACTOR = 1.1
+"""Height of the view, relative to the longer side of the map."""
 Values = Mapping[str, Any]
 
 
 def layout(topics: Collection[str], colours: Sequence[str], rows: int, cols: int, cell_m: float) -> dict[str, Any]:
-    """The layout for a file with these topics; `colours`: one a UAV, `#RRGGBB`. Topics the file lacks are left out."""
-    height = MARGIN * max(rows, cols) * cell_m
+    """Return the layout for a file with these topics; other topics are left out.
+
+    `colours`: one per UAV, `#RRGGBB`. `rows`, `cols`: of the grid. `cell_m`: width of a cell, metres.
+    """
+    height = VIEW_HEIGHT_FACTOR * max(rows, cols) * cell_m
     values = {"<x>": cols * cell_m / 2, "<y>": rows * cell_m / 2, "<height>": height, "<cell>": cell_m}
     uavs = [{"<id>": str(i), "<colour>": colour, "<first>": i == 0} for i, colour in enumerate(colours)]
     template = json.loads(files("tmc.analysis.viewer").joinpath(FILE).read_text("utf-8"))
@@ -28,7 +31,7 @@ def layout(topics: Collection[str], colours: Sequence[str], rows: int, cols: int
 
 
 def topics_of(node: Any) -> Iterator[str]:
-    """Every topic that a layout names: a string that begins with a slash, up to the field of its messages."""
+    """Yield every topic in a layout: a string that begins with a slash, without the field of its messages."""
     if isinstance(node, dict):
         node = [*node.keys(), *node.values()]
     if isinstance(node, list):
@@ -53,7 +56,7 @@ def _filled(node: Any, values: Values, uavs: Sequence[Values]) -> Any:
 
 
 def _owners(text: str, values: Values, uavs: Sequence[Values]) -> list[Values]:
-    """The values for each entry that one of the template becomes."""
+    """Return the values of each entry that an entry of the template becomes."""
     return [{**values, **uav} for uav in uavs] if "<id>" in text and "<id>" not in values else [values]
 
 
@@ -64,7 +67,7 @@ def _text(text: str, values: Values) -> str:
 
 
 def _kept(node: Any, topics: Collection[str]) -> Any:
-    """Without the entries that name a topic which is not there."""
+    """Return the layout without the entries that name a missing topic."""
     if isinstance(node, dict):
         return {key: _kept(value, topics) for key, value in node.items() if set(topics_of(key)) <= set(topics)}
     if isinstance(node, list):

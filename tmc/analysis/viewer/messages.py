@@ -1,6 +1,6 @@
-"""Messages that viewers draw: poses, frames and the scene. All in the frame of the grid, metres, x east, y north.
+"""Build the messages that viewers draw: poses, frames and the scene, in the grid's frame (metres, x east, y north).
 
-Every field of a position is set, zero or not: converters of viewers look for the sub-messages.
+Every field of a position is set, even to zero, since converters of viewers look for the sub-messages.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from tmc.record.builders import FRAME
 from tmc.record.schemas import foxglove, message_class
 
 WORLD = "world"
-"""The frame above the grid's: the same place."""
+"""The parent of the grid's frame; both have the same origin."""
 SHAPES: tuple[tuple[str, dict[str, float]], ...] = (
     ("spheres", {}),
     ("cubes", {}),
     ("cylinders", {"bottom_scale": 1.0, "top_scale": 1.0}),
     ("cylinders", {"bottom_scale": 1.0, "top_scale": 0.0}),
 )
-"""What UAVs are drawn as, the next one each time that the colours are used up: a field of SceneEntity, and its own."""
-HEIGHT = 0.5
-"""Where UAVs and their trails are drawn above the map, in cells: the lowest UAV is furthest up."""
+"""Shapes of UAVs; UAVs of the same colour differ by shape. A field of SceneEntity, and fields of the shape."""
+HEIGHT_CELLS = 0.5
+"""Height of UAVs and their trails above the map, in cell widths. The UAV with the lowest id is highest."""
 Point = tuple[float, float]
 
 
 def pose_in_frame(at: Point, yaw: float, time_ns: int) -> Any:
-    """A foxglove.PoseInFrame; `yaw`: radians from the east, to the north."""
+    """Return a foxglove.PoseInFrame. `yaw`: radians, from east to north."""
     message = message_class("foxglove.PoseInFrame")(frame_id=FRAME)
     message.timestamp.FromNanoseconds(time_ns)
     _place(message.pose, at, 0.0, yaw)
@@ -35,7 +35,7 @@ def pose_in_frame(at: Point, yaw: float, time_ns: int) -> Any:
 
 
 def world_to_map(time_ns: int) -> Any:
-    """The foxglove.FrameTransform that viewers need once: the grid lies where the world does."""
+    """Return the foxglove.FrameTransform that viewers need once: the identity."""
     message = message_class("foxglove.FrameTransform")(parent_frame_id=WORLD, child_frame_id=FRAME)
     message.timestamp.FromNanoseconds(time_ns)
     message.translation.x = message.translation.y = message.translation.z = 0.0
@@ -44,7 +44,7 @@ def world_to_map(time_ns: int) -> Any:
 
 
 def scene(entities: Iterable[Any], gone: Iterable[str], time_ns: int) -> Any:
-    """A foxglove.SceneUpdate: these entities as they are now, and without those that are gone."""
+    """Return a foxglove.SceneUpdate that replaces `entities` and deletes those with an id in `gone`."""
     message = message_class("foxglove.SceneUpdate")(entities=entities)
     matching = foxglove("SceneEntityDeletion").SceneEntityDeletion.MATCHING_ID
     for name in gone:
@@ -53,14 +53,14 @@ def scene(entities: Iterable[Any], gone: Iterable[str], time_ns: int) -> Any:
 
 
 def uav_entity(uav: int, trail: Sequence[Point], colour: str, shape: int, cell_m: float, time_ns: int) -> Any:
-    """A foxglove.SceneEntity `uav-<id>`: a body at the trail's last place, its number beside it, and the trail.
+    """Return a foxglove.SceneEntity `uav-<id>`: a body at the last point of the trail, its number, and the trail.
 
-    `colour`: `#RRGGBB`; `shape`: a place in SHAPES, over again after the last.
+    `trail`: points, metres. `colour`: `#RRGGBB`. `shape`: index in SHAPES, modulo its length.
     """
     entity = message_class("foxglove.SceneEntity")(frame_id=FRAME, id=entity_id(uav))
     entity.timestamp.FromNanoseconds(time_ns)
     entity.lifetime.FromNanoseconds(0)  # until it is replaced or deleted
-    z = HEIGHT * cell_m / (1 + uav / 100)
+    z = HEIGHT_CELLS * cell_m / (1 + uav / 100)
     x, y = trail[-1]
     kind, scales = SHAPES[shape % len(SHAPES)]
     body = getattr(entity, kind).add(**scales)
@@ -79,7 +79,7 @@ def uav_entity(uav: int, trail: Sequence[Point], colour: str, shape: int, cell_m
 
 
 def entity_id(uav: int) -> str:
-    """What the scene calls a UAV."""
+    """Return the id of a UAV in the scene."""
     return f"uav-{uav}"
 
 
@@ -89,6 +89,6 @@ def _place(pose: Any, at: Point, z: float, yaw: float = 0.0) -> None:
 
 
 def _paint(color: Any, colour: str) -> None:
-    """`colour`: `#RRGGBB`."""
+    """Set a colour, given as `#RRGGBB`."""
     color.r, color.g, color.b = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
     color.a = 1.0

@@ -1,4 +1,4 @@
-"""One episode tick by tick, from the TMC's log alone: where everybody was, what was sensed, and who was answered."""
+"""Read one episode tick by tick from the TMC's log: cells, sightings and exchanges."""
 
 from __future__ import annotations
 
@@ -17,23 +17,26 @@ from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import tmc_log
 
-EVERY = 10_000
-"""Messages read between two words of progress."""
+PROGRESS_MESSAGES = 10_000
+"""Messages between two reports of progress."""
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
     """An episode up to tick T, the last one that is final for the whole team; N = `team.size`.
 
-    `cells`: shape (T + 1, N), UNKNOWN where a UAV was lost. `actions`, `blocks`, `rewards` (by the UAV's own map): the
-    same shape, of the move that led to the tick. `policies`: the same shape, the version that chose it.
-    `seen`: {(tick, uav): cells of the peers sensed}. `answered`: {tick: UAVs that the TMC gave its map}.
-    `events`: {tick: cells}. `uncertainty`, `reward`: shape (T + 1,), the sum over cells of the true map and the mean of
-    the team as the TMC logged them. `roads`: the road network as GeoJSON, empty for a map without streets.
-    `whole`: T is the end of the episode. `notes`: what to know of the run. `damage`: what is wrong with its log within
-    the episode, or None; a log that still grows is not damaged.
+    `cells`: shape (T + 1, N); UNKNOWN where a UAV was lost.
+    `actions`, `blocks`, `rewards` (by the UAV's own map): shape (T + 1, N), of the move that led to the tick.
+    `policies`: shape (T + 1, N), version of the policy that chose the move.
+    `seen`: {(tick, uav): cells of the peers sensed}. `answered`: {tick: UAVs that got the TMC's map}.
+    `events`: {tick: cells}.
+    `uncertainty`, `reward`: shape (T + 1,), as logged by the TMC: true map, summed over cells; mean per UAV.
+    `roads`: the road network as GeoJSON; empty for a map without streets.
+    `whole`: T is the end of the episode. `notes`: remarks on the run.
+    `damage`: what is wrong with the log within the episode, or None. A log that still grows is not damaged.
     """
 
     world: World
@@ -55,36 +58,34 @@ class Timeline:
 
     @property
     def ticks(self) -> int:
-        """T."""
+        """T, the last tick."""
         return len(self.uncertainty) - 1
 
 
-def read(folder: Path, episode: int, show: Callable[[str], None] = lambda _: None) -> Timeline:
-    """Read one episode of a run; RecordError when the log has nothing of it. `show` gets words of progress."""
-    path = run_files(folder).get("tmc")
-    if path is None:
-        raise RecordError(f"{folder} holds no tmc.mcap: give the folder of the run on the host where the TMC ran")
+def read_timeline(folder: Path, episode: int, show: Callable[[str], None] = lambda _: None) -> Timeline:
+    """Read one episode of a run; RecordError when the log holds nothing of it. `show` gets the progress in words."""
+    path = tmc_log(folder)
     world, notes = world_of(folder, path)
-    gathered, log = _Gathered(world, episode), Log(path)
+    collector, log = _Collector(world, episode), Log(path)
     for number, raw in enumerate(log.raw(), start=1):
         handler = _HANDLERS.get(raw.schema)
-        if handler is not None and gathered.take(decode(raw), handler):
+        if handler is not None and collector.add(decode(raw), handler):
             break  # the episode is over, so nothing of it follows
         if raw.topic == "/map/roads":
-            gathered.roads = decode(raw).geojson
-        if number % EVERY == 0:
+            collector.roads = decode(raw).geojson
+        if number % PROGRESS_MESSAGES == 0:
             show(f"reading {path.name}: {number:,} messages")
     else:
-        gathered.damage = None if log.still_open else log.damage
-    return gathered.timeline(folder, tuple(notes))
+        collector.damage = None if log.still_open else log.damage
+    return collector.timeline(folder, tuple(notes))
 
 
-class _Gathered:
-    """What the messages of one episode tell; repeats say the same again."""
+class _Collector:
+    """Collect the messages of one episode. Repeats overwrite equal values."""
 
     def __init__(self, world: World, episode: int) -> None:
         shape = (world.config.training.ticks + 1, world.config.team.size)
-        self.world, self.episode, self.held = world, episode, set[int]()
+        self.world, self.episode, self.found = world, episode, set[int]()
         self.cells = np.full(shape, UNKNOWN, np.int64)
         self.actions, self.blocks = np.full(shape, STAY, np.uint8), np.zeros(shape, np.uint8)
         self.rewards, self.policies = np.zeros(shape, np.float32), np.zeros(shape, np.int64)
@@ -95,9 +96,9 @@ class _Gathered:
         self.roads = ""
         self.damage: str | None = None
 
-    def take(self, message: Any, handler: Callable[[_Gathered, Any], None]) -> bool:
-        """Take a message in, if it is of the episode; True once the episode is over."""
-        self.held.add(message.episode)
+    def add(self, message: Any, handler: Callable[[_Collector, Any], None]) -> bool:
+        """Add a message if it is of the episode; return True once the episode is over."""
+        self.found.add(message.episode)
         if message.episode == self.episode:
             try:
                 handler(self, message)
@@ -115,7 +116,7 @@ class _Gathered:
             or max(m.actions, default=0) > STAY
             or max(m.blocks, default=0) > max(Block)
         ):
-            raise ValueError("a record that no UAV can send")
+            raise ValueError("a record that no UAV sends")
         ticks, moves = slice(m.first, m.tick + 1), slice(max(m.first, 1), m.tick + 1)
         self.cells[ticks, m.uav] = m.cells
         for table, values in ((self.actions, m.actions), (self.blocks, m.blocks), (self.rewards, m.rewards)):
@@ -142,21 +143,21 @@ class _Gathered:
             events[tick].append(cell)
         self.events |= events
 
-    def _begins_or_ends(self, _: Any) -> None:
-        """Only that it does matters."""
+    def _ignore(self, _: Any) -> None:
+        """Add nothing: only the phase of the message matters, in `add`."""
 
     def _check_cells(self, *cells: int) -> None:
         if max(cells, default=0) >= self.world.grid.size:
             raise IndexError("a cell off the grid")
 
     def timeline(self, folder: Path, notes: tuple[str, ...]) -> Timeline:
-        """The ticks that are final; RecordError when there are none."""
+        """Return the ticks that are final; RecordError when there are none."""
         final = np.flatnonzero(np.append(np.isnan(self.uncertainty), True))[0]
         if not final:
-            known = f"{min(self.held)} to {max(self.held)}" if len(self.held) > 1 else "".join(map(str, self.held))
-            flown = f"ask for {known}" if known else "nothing was flown"
+            known = f"{min(self.found)} to {max(self.found)}" if len(self.found) > 1 else "".join(map(str, self.found))
+            advice = f"ask for {known}" if known else "nothing was flown"
             damaged = f" ({self.damage})" if self.damage else ""
-            raise RecordError(f"{folder} holds no tick of episode {self.episode}: {flown}{damaged}")
+            raise RecordError(f"{folder} holds no tick of episode {self.episode}: {advice}{damaged}")
         upto = slice(0, final)
         return Timeline(
             self.world, self.episode, self.cells[upto], self.actions[upto], self.blocks[upto], self.rewards[upto],
@@ -165,10 +166,10 @@ class _Gathered:
         )  # fmt: skip
 
 
-_HANDLERS: dict[str, Callable[[_Gathered, Any], None]] = {
-    "overfly.FlightRecord": _Gathered._record,
-    "overfly.Sync": _Gathered._sync,
-    "overfly.TeamMetrics": _Gathered._metrics,
-    "overfly.Events": _Gathered._events,
-    "overfly.Episode": _Gathered._begins_or_ends,
+_HANDLERS: dict[str, Callable[[_Collector, Any], None]] = {
+    "overfly.FlightRecord": _Collector._record,
+    "overfly.Sync": _Collector._sync,
+    "overfly.TeamMetrics": _Collector._metrics,
+    "overfly.Events": _Collector._events,
+    "overfly.Episode": _Collector._ignore,
 }

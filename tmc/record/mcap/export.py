@@ -1,6 +1,6 @@
-"""Writes an MCAP file that is made from logs, such as a merged or a replay file: all of it, or nothing.
+"""Write an MCAP file that is made from logs, such as a merged or a replay file: whole, or not at all.
 
-It grows beside its place as `<name>.new` and takes its name when it is whole. A log of a run is never written over.
+It grows as `<name>.new` and takes its name when it is whole. A log of a run is never overwritten.
 """
 
 from __future__ import annotations
@@ -11,73 +11,78 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
-from tmc.record import schemas
+from tmc.record import disk, schemas
 from tmc.record.channels import ACTIVE, CHANNELS, role
 from tmc.record.errors import RecordError
+from tmc.record.mcap.parser import PROFILE
 from tmc.record.mcap.writer import mcap_writer
 
-CHUNK = 2**20
-"""Bytes of a chunk before compression."""
+CHUNK_BYTES = 2**20
+"""Size of a chunk before compression."""
 
 
 class Export:
-    """The file `path` while it is written; a context: leaving it by an exception leaves no file.
+    """Write the file `path`. A context: leaving it by an exception leaves no file.
 
-    Messages are given in order of their log time. Raises RecordError when the file cannot be written, or must not be.
+    Messages must come in order of their log time. Raises RecordError when the file cannot be written, or is the name of
+    a run's log.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self._new = self.path.with_name(self.path.name + ".new")
+        self._new = self.path.with_name(self.path.name + disk.NEW_SUFFIX)
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._channels: dict[tuple[str, str, bytes, str], int] = {}
         self._sequences: dict[str, int] = {}
-        self._described: dict[str, bytes] = {}
+        self._definitions: dict[str, bytes] = {}
         if _names_a_log(self.path):
             raise RecordError(f"{self.path} is the name of a run's log: choose another name for the file")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self._new.open("wb")
         except OSError as error:
-            raise self._unwritable(error) from None
-        self._writer = mcap_writer(self._file, CHUNK)
+            raise self._failed(error) from None
+        self._writer = mcap_writer(self._file, CHUNK_BYTES)
         with self._guard():
-            self._writer.start(profile="overfly")
+            self._writer.start(profile=PROFILE)
 
     def write(self, topic: str, message: Any, time_ns: int) -> None:
-        """Log a protobuf message; both its times are `time_ns`, and it gets the topic's next number from 0."""
+        """Write a protobuf message. Both its times are `time_ns`; it gets the topic's next number, from 0."""
         name = message.DESCRIPTOR.full_name
         number = self._sequences.get(topic, 0)
         self._sequences[topic] = number + 1
-        if name not in self._described:
-            self._described[name] = schemas.schema_bytes(name)
-        self.put(topic, name, self._described[name], message.SerializeToString(), time_ns, time_ns, number)
+        if name not in self._definitions:
+            self._definitions[name] = schemas.schema_bytes(name)
+        self.put(topic, name, self._definitions[name], message.SerializeToString(), time_ns, time_ns, number)
 
     def put(
-        self, topic: str, schema: str, described: bytes, data: bytes, log_time: int, publish_time: int, sequence: int,
+        self, topic: str, schema: str, definition: bytes, data: bytes, log_time: int, publish_time: int, sequence: int,
         process: str = "",
     ) -> None:  # fmt: skip
-        """Log bytes as given. Topics of one name that come from several processes become a channel each."""
-        key = (topic, schema, described, process)
+        """Write the bytes of a message as given. A topic that comes from several processes gets a channel per process.
+
+        `definition`: the schema as MCAP stores it; see `schemas.schema_bytes`.
+        """
+        key = (topic, schema, definition, process)
         channel = self._channels.get(key)
         if channel is None:
-            channel = self._channels[key] = self._register(topic, schema, described, process)
+            channel = self._channels[key] = self._register(topic, schema, definition, process)
         with self._guard():
             self._writer.add_message(channel, log_time, data, publish_time, sequence)
 
-    def _register(self, topic: str, schema: str, described: bytes, process: str) -> int:
-        if (schema, described) not in self._schemas:
-            self._schemas[schema, described] = self._writer.register_schema(schema, "protobuf", described)
+    def _register(self, topic: str, schema: str, definition: bytes, process: str) -> int:
+        if (schema, definition) not in self._schemas:
+            self._schemas[schema, definition] = self._writer.register_schema(schema, "protobuf", definition)
         facts = {"process": process} if process else {}
-        return int(self._writer.register_channel(topic, "protobuf", self._schemas[schema, described], facts))
+        return int(self._writer.register_channel(topic, "protobuf", self._schemas[schema, definition], facts))
 
     def attach(self, name: str, media_type: str, data: bytes, log_time: int = 0, create_time: int = 0) -> None:
-        """Put a file into the file."""
+        """Attach a file."""
         with self._guard():
             self._writer.add_attachment(create_time, log_time, name, media_type, data)
 
     def add_metadata(self, name: str, facts: Mapping[str, str]) -> None:
-        """Put facts into the file."""
+        """Write metadata."""
         with self._guard():
             self._writer.add_metadata(name, dict(facts))
 
@@ -89,7 +94,7 @@ class Export:
             if kind is None:
                 self._finish()
         finally:
-            with suppress(OSError):  # of a disk that is full, once more
+            with suppress(OSError):  # a full disk raises again
                 self._file.close()
             self._new.unlink(missing_ok=True)
 
@@ -105,13 +110,13 @@ class Export:
         try:
             yield
         except OSError as error:
-            raise self._unwritable(error) from None
+            raise self._failed(error) from None
 
-    def _unwritable(self, error: OSError) -> RecordError:
+    def _failed(self, error: OSError) -> RecordError:
         return RecordError(f"{self.path} cannot be written ({error.strerror}): choose another place with --out")
 
 
 def _names_a_log(path: Path) -> bool:
-    """True of `tmc.mcap`, `uav-003.mcap.active` and the like."""
+    """True for `tmc.mcap`, `uav-003.mcap.active` and the like."""
     process, _, suffix = path.name.partition(".")
     return suffix in ("mcap", f"mcap{ACTIVE}") and role(process) in {channel.process for channel in CHANNELS}

@@ -1,4 +1,4 @@
-"""What is found in a damaged file: messages, what is lost, and what is said of it."""
+"""What a scan of a damaged file found: messages, lost spans, and notes."""
 
 from __future__ import annotations
 
@@ -6,27 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Attachment, Metadata
 
-CUT = "it is cut"
-"""Why the end of a file is lost that a kill left behind."""
-
-
-@dataclass(frozen=True, slots=True)
-class Message:
-    """A message as it stands in the file, with the channel and the schema that describe it."""
-
-    channel: Channel
-    schema: Schema | None
-    log_time: int
-    publish_time: int
-    sequence: int
-    data: bytes
+from tmc.record.mcap.parser import Message
 
 
 @dataclass(frozen=True)
-class Lost:
-    """A stretch of the file that nothing intact was found in: where, how long, and why."""
+class LostSpan:
+    """A span of the file in which nothing is intact: offset and length in bytes, and the reason."""
 
     at: int
     bytes: int
@@ -38,10 +25,11 @@ class Lost:
 
 @dataclass
 class Findings:
-    """What came of reading a file to its end.
+    """The result of reading a file to its end.
 
-    `finished`: it was closed in order. `missing`: messages that are missing, as the numbers of others tell; `nameless`:
-    intact ones whose topic nothing intact tells. `notes`: what is wrong without anything being lost.
+    `finished`: it was closed in order. `messages`: intact ones. `missing`: messages that are missing, by the gaps in
+    the sequence numbers of the others. `nameless`: intact messages whose topic no intact record describes. `notes`:
+    damage by which nothing is lost.
     """
 
     profile: str = ""
@@ -49,20 +37,20 @@ class Findings:
     messages: int = 0
     missing: int = 0
     nameless: int = 0
-    lost: list[Lost] = field(default_factory=list)
+    lost: list[LostSpan] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @property
     def whole(self) -> bool:
-        """Nothing is lost."""
+        """True when nothing is lost."""
         return not (self.lost or self.missing or self.nameless)
 
 
 Item: TypeAlias = list[Message] | Metadata | Attachment
 
 Show = Callable[[str, float], None]
-"""Is told what is done, and how much of it: 0 to 1."""
+"""Show progress: gets the words for the work, and the share that is done, 0 to 1."""
 
 
 def unseen(_what: str, _share: float) -> None:
-    """Shows nothing."""
+    """Show nothing."""

@@ -1,178 +1,196 @@
-"""The records of an MCAP file, one after the other, each checked; reading stops at the first that is not intact.
+"""Parse the bytes of MCAP: the head of a record, its body, and the messages of a chunk.
 
-A file is magic, records, magic; a record is an opcode (u8), a length (u64) and so many bytes. mcap's own readers take
-short reads for whole ones, skip records whose opcode was damaged, and check neither the summary nor attachments.
+This module alone knows the layout of records. Both readers use it: `strict`, which stops at the first damage, and
+`salvage`, which continues behind it. A file is magic, records, magic. A record is an opcode (u8), the length of its
+body (u64) and the body. mcap's own readers accept short reads, skip records whose opcode is damaged, and check neither
+the summary nor attachments, so they are not used.
 """
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
-from typing import IO, Any
+from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Footer, Header, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
 MAGIC = b"\x89MCAP0\r\n"
+PROFILE = "overfly"
+"""The profile of Overfly's files, whose messages are numbered per topic."""
 RECOVERED = "overfly/recovered"
-"""Metadata of a file that was made of what was intact in another one: what is missing in it, and that this is known."""
-_HEAD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_DATA = frozenset((Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA))
-"""What our files hold before DataEnd: schemas, channels and messages are always in chunks."""
+"""Name of the metadata in a recovered file: what is missing in it. Readers then accept gaps in the sequence numbers."""
+CUT = "it is cut"
+"""The reason for damage at the end of a file whose writer was killed."""
+UNKNOWN_LENGTH = "the length of a record is damaged"
+"""The reason for a record that seems to end behind records that are intact."""
+RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode, and length of the body in bytes."""
+DATA_END_BYTES = RECORD_HEAD.size + 4
+FOOTER_BYTES = RECORD_HEAD.size + 20
+CHUNK_LIMIT_BYTES = 1 << 32
+"""Largest chunk before compression that is decompressed: a damaged size must not use up all memory."""
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Channel, sequence number, log time (ns), publish time (ns)."""
+_SEQUENCE_MASK = (1 << 32) - 1
+_SEQUENCE_HALF = 1 << 31
+"""Sequence numbers wrap at 32 bits: one that lies at least this far ahead lies before the expected one."""
 
 
-class DamageError(Exception):
-    """The file is not intact from here on. `cut`: it just ends too early, at byte `size`, as after a kill."""
-
-    def __init__(self, at: int, why: str, cut: bool = False, size: int = 0) -> None:
-        super().__init__(f"{why}, at byte {at}")
-        self.at, self.cut, self.size = at, cut, size
+class BadRecordError(Exception):
+    """A record is not intact. The text is the reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class Raw:
-    """A message as it stands in the file: `data` is of the schema `schema`, described by `described` (descriptor set).
+class Message(NamedTuple):
+    """A message as it stands in the file. `data` is a protobuf message of type `schema`.
 
-    `log_time`, `publish_time`: ns. `sequence`: a counter a topic.
+    `log_time`, `publish_time`: ns. `sequence`: a counter per topic. `channel`, `definition`: the records that describe
+    it; `definition` is None and `schema` empty where the channel has no schema.
     """
 
     topic: str
     schema: str
-    described: bytes
     log_time: int
     publish_time: int
     sequence: int
     data: bytes
+    channel: Channel
+    definition: Schema | None
 
 
-def frames(file: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
-    """(offset, opcode, body) of each record up to the footer; raises DamageError.
+@dataclass
+class ChannelTable:
+    """Schemas and channels by id, and the next sequence number of each channel."""
 
-    Returns quietly when the file ends after a whole record, as one does that is still written. What is appended
-    after the call is not read.
-    """
-    size = os.fstat(file.fileno()).st_size
-    magic = file.read(len(MAGIC))
-    if magic != MAGIC:
-        raise DamageError(0, "it is cut", cut=True) if MAGIC.startswith(magic) else DamageError(0, "it is not MCAP")
-    at, crc, summary = len(MAGIC), zlib.crc32(magic), False
-    while at < size:
-        head = file.read(_HEAD.size)
-        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, size)
-        if at + _HEAD.size + length > size:
-            raise DamageError(at, "it is cut", cut=True, size=size)
-        body = file.read(length)
-        if opcode == Opcode.FOOTER:
-            _check_end(file, at, body, zlib.crc32(body[:-4], zlib.crc32(head, crc)), summary)
-            yield at, opcode, body
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    next: dict[int, int] = field(default_factory=dict)
+
+    def copy(self) -> ChannelTable:
+        """Return a table that can change without this one."""
+        return ChannelTable(dict(self.schemas), dict(self.channels), dict(self.next))
+
+    def add(self, opcode: int, body: bytes) -> None:
+        """Add a schema or a channel; ignore other records. BadRecordError when it contradicts what the table holds."""
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
             return
-        if opcode == Opcode.DATA_END and not summary:
-            _check_crc(at, body, crc, "the data section")
-            crc, summary = 0, True
-        else:
-            if not summary and opcode not in _DATA:
-                raise DamageError(at, f"a record of unknown kind {opcode}")
-            crc = zlib.crc32(body, zlib.crc32(head, crc))
-        yield at, opcode, body
-        at += _HEAD.size + length
-    if summary:
-        raise DamageError(at, "it is cut", cut=True)
+        known: dict[int, Any] = self.schemas if opcode == Opcode.SCHEMA else self.channels
+        record = (Schema if opcode == Opcode.SCHEMA else Channel).read(_stream(body))
+        if known.setdefault(record.id, record) != record:
+            raise BadRecordError("its descriptions contradict those before")
 
 
-def _check_end(file: IO[bytes], at: int, body: bytes, crc: int, summary: bool) -> None:
-    if not summary:
-        raise DamageError(at, "it ends before its data does")
-    _check_crc(at, body, crc, "the summary")
-    end = file.read(len(MAGIC) + 1)
-    if end != MAGIC:
-        cut = MAGIC.startswith(end)
-        raise DamageError(at, "it is cut" if cut else "its end is not MCAP's", cut)
+class ChunkParser:
+    """Parse the messages of one chunk.
 
-
-def _check_crc(at: int, body: bytes, crc: int, what: str) -> None:
-    """Compare the CRC that the last four bytes of a body state; 0 stands for "none"."""
-    stated = int.from_bytes(body[-4:], "little")
-    if len(body) < 4 or stated not in (0, crc):
-        raise DamageError(at, f"the CRC of {what} is wrong")
-
-
-def contents(file: IO[bytes]) -> Iterator[list[Raw] | Metadata | Attachment | None]:
-    """What the file holds, in its order: the messages of a chunk, metadata, an attachment; None at the footer.
-
-    A chunk is checked as a whole before anything of it is given out. Raises DamageError.
-    """
-    chunks = _Chunks()
-    for at, opcode, body in frames(file):
-        try:
-            if opcode == Opcode.CHUNK:
-                yield chunks.messages(body)
-            elif opcode == Opcode.METADATA:
-                metadata = Metadata.read(ReadDataStream(BytesIO(body)))
-                chunks.gaps |= metadata.name == RECOVERED
-                yield metadata
-            elif opcode == Opcode.ATTACHMENT:
-                _check_crc(at, body, zlib.crc32(body[:-4]), "an attachment")
-                yield Attachment.read(ReadDataStream(BytesIO(body)))
-            elif opcode == Opcode.FOOTER:
-                yield None
-        except (GeneratorExit, DamageError):
-            raise
-        except Exception as error:  # garbage makes zstandard and struct raise whatever they like
-            raise DamageError(at, f"a record is not intact ({error})") from None
-
-
-class _Chunks:
-    """What the chunks so far have told: schemas, channels, and the next sequence number of each channel.
-
-    `gaps`: messages may be missing, but their numbers still go up.
+    `table`: what the chunks before it described; it is updated. `numbered`: the sequence numbers of a channel must go
+    up. `first`: the number with which a channel begins; None: any. After `messages`, `missing` is the number of gaps in
+    the sequence numbers in messages, `missing_before` the number after the first gap, and `nameless` the number of
+    messages that are dropped because nothing describes their channel.
     """
 
-    def __init__(self) -> None:
-        self.gaps = False
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._next: dict[int, int] = {}
+    def __init__(self, table: ChannelTable, numbered: bool = True, first: int | None = None) -> None:
+        self.table, self.numbered, self.first = table, numbered, first
+        self.missing = self.nameless = 0
+        self.missing_before: int | None = None
 
-    def messages(self, body: bytes) -> list[Raw]:
-        """All messages of a chunk; raises anything when it is not intact, a gap in the numbers included."""
-        head = ReadDataStream(BytesIO(body))
-        chunk = Chunk.read(head)
-        stream, size = get_chunk_data_stream(chunk)
-        data, at, found = stream.read(size), 0, []
-        if head.count != len(body) or zlib.crc32(data) != chunk.uncompressed_crc:  # 0 is no "none": garbage may be 0
-            raise ValueError("the CRC of a chunk is wrong")
+    def messages(self, body: bytes) -> list[Message]:
+        """Return the messages of the body of a chunk record. BadRecordError, or any other, when it is not intact."""
+        data, at, found = _decompressed(body), 0, []
+        size, unpack = len(data), RECORD_HEAD.unpack_from
         while at < size:
-            opcode, length = _HEAD.unpack_from(data, at)
-            start, at = at + _HEAD.size, at + _HEAD.size + length
+            opcode, length = unpack(data, at)
+            start, at = at + RECORD_HEAD.size, at + RECORD_HEAD.size + length
             if opcode == Opcode.MESSAGE:
-                found.append(self._message(data, start, at))
+                message = self._message(data, start, at)
+                if message is not None:
+                    found.append(message)
             else:
-                self._describe(opcode, data[start:at])
+                self.table.add(opcode, data[start:at])
         return found
 
-    def _describe(self, opcode: int, body: bytes) -> None:
-        stream = ReadDataStream(BytesIO(body))
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream)
-            self._schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(stream)
-            self._channels[channel.id] = channel
+    def _message(self, data: bytes, start: int, end: int) -> Message | None:
+        number, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
+        table = self.table
+        if self.numbered:
+            gap = (sequence - table.next.get(number, sequence if self.first is None else self.first)) & _SEQUENCE_MASK
+            if gap:
+                self._skip(gap, sequence)
+            table.next[number] = (sequence + 1) & _SEQUENCE_MASK
+        channel = table.channels.get(number)
+        schema = table.schemas.get(channel.schema_id) if channel is not None else None
+        if channel is None or (schema is None and channel.schema_id):
+            self.nameless += 1
+            return None
+        payload = data[start + _MESSAGE_HEAD.size : end]
+        name = "" if schema is None else schema.name
+        return Message(channel.topic, name, log_time, publish_time, sequence, payload, channel, schema)
 
-    def _message(self, data: bytes, start: int, end: int) -> Raw:
-        number, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, start)
-        gap = (sequence - self._next.get(number, sequence)) & 0xFFFF_FFFF
-        if gap and not (self.gaps and gap < 1 << 31):
-            raise ValueError(f"messages are missing before number {sequence}")
-        self._next[number] = (sequence + 1) & 0xFFFF_FFFF
-        channel = self._channels[number]
-        schema: Any = self._schemas[channel.schema_id]
-        payload = data[start + _MESSAGE.size : end]
-        return Raw(channel.topic, schema.name, schema.data, log_time, publish_time, sequence, payload)
+    def _skip(self, gap: int, sequence: int) -> None:
+        if gap >= _SEQUENCE_HALF:
+            raise BadRecordError("its messages were read before")
+        self.missing += gap
+        if self.missing_before is None:
+            self.missing_before = sequence
+
+
+def _decompressed(body: bytes) -> bytes:
+    """Return the records in a chunk, checked by size and CRC. A CRC of 0 is compared too: garbage may hold a 0."""
+    head = _stream(body)
+    chunk = Chunk.read(head)
+    if head.count != len(body) or chunk.uncompressed_size > CHUNK_LIMIT_BYTES:
+        raise BadRecordError("the size of a chunk is damaged")
+    stream, size = get_chunk_data_stream(chunk)
+    data: bytes = stream.read(size)
+    if size != chunk.uncompressed_size or zlib.crc32(data) != chunk.uncompressed_crc:
+        raise BadRecordError("the CRC of a chunk is wrong")
+    return data
+
+
+def parse_header(body: bytes) -> Header:
+    """Return the header of a file; BadRecordError unless its two texts fill the body."""
+    header = Header.read(_stream(body))
+    if sum(4 + len(text.encode()) for text in vars(header).values()) != len(body):
+        raise BadRecordError("its header is damaged")
+    return header
+
+
+def parse_metadata(body: bytes) -> Metadata:
+    """Return a metadata record; BadRecordError unless it fills the body."""
+    stream = _stream(body)
+    metadata = Metadata.read(stream)
+    if stream.count != len(body):
+        raise BadRecordError("metadata are damaged")
+    return metadata
+
+
+def parse_attachment(body: bytes) -> Attachment:
+    """Return an attachment; BadRecordError when its CRC is wrong."""
+    check_crc(body, zlib.crc32(body[:-4]), "an attachment", required=True)
+    return Attachment.read(_stream(body))
+
+
+def parse_footer(body: bytes) -> Footer:
+    """Return the footer of a file."""
+    return Footer.read(_stream(body))
+
+
+def check_index(body: bytes) -> None:
+    """Raise BadRecordError unless the length of a message index fits its entries. Its content is not used."""
+    if len(body) < 6 or int.from_bytes(body[2:6], "little") != len(body) - 6 or (len(body) - 6) % 16:
+        raise BadRecordError("an index is damaged")
+
+
+def check_crc(body: bytes, crc: int, what: str, *, required: bool = False) -> None:
+    """Raise BadRecordError unless the last four bytes of `body` state `crc`, or 0 for "none" if not `required`."""
+    stated = int.from_bytes(body[-4:], "little")
+    if len(body) < 4 or (stated != crc and (required or stated)):
+        raise BadRecordError(f"the CRC of {what} is wrong")
+
+
+def _stream(body: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(body))

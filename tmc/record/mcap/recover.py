@@ -1,4 +1,4 @@
-"""Makes a intact, finished log of a file that was cut or damaged: `overfly log recover`."""
+"""Make an intact, finished log of a file that was cut or damaged: `overfly log recover`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mcap.records import Metadata
 
 from tmc.kernel.config import JournalConfig
 from tmc.record import disk
-from tmc.record.channels import ACTIVE
 from tmc.record.errors import NoLogError, RecordError
 from tmc.record.mcap import rewrite
 from tmc.record.mcap.findings import Findings, Item, Show, unseen
 from tmc.record.mcap.parser import RECOVERED
 from tmc.record.mcap.salvage import salvage
+from tmc.record.run_folder import finished_name
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What came of one file; `out` is None where there was nothing to do."""
+    """The result for one file. `out` is None where there was nothing to do."""
 
     path: Path
     out: Path | None
@@ -32,11 +32,11 @@ class Recovery:
 
     @property
     def clean(self) -> bool:
-        """Nothing that the file held is lost."""
+        """True when nothing that the file held is lost."""
         return self.found.whole
 
     def lines(self) -> Iterator[str]:
-        """What the user is told."""
+        """Yield the report for the user."""
         found = self.found
         if self.out is None:
             yield f"{self.path}: intact and finished, {found.messages:,} messages; there is nothing to do"
@@ -49,70 +49,67 @@ class Recovery:
 
 
 def losses(found: Findings) -> Iterator[str]:
-    """What is lost, a phrase each."""
+    """Yield what is lost, one phrase each."""
     yield from map(str, found.lost)
     if found.missing:
-        yield f"{found.missing:,} messages, as the numbers of the others tell"
+        yield f"{found.missing:,} messages, by the gaps in the numbers of the others"
     if found.nameless:
         yield f"{found.nameless:,} intact messages whose topics were described in what is lost"
 
 
 def recovered_name(path: Path) -> Path:
-    """`X.recovered.mcap` for X.mcap and for X.mcap.active."""
+    """Return `X.recovered.mcap` for X.mcap and for X.mcap.active."""
     return path.with_name(path.name.partition(".mcap")[0] + ".recovered.mcap")
 
 
-def finished_name(path: Path) -> Path:
-    """The name of the finished log that a file is, or was to become."""
-    return path.with_name(path.name.removesuffix(ACTIVE))
-
-
 def recover(path: Path, out: Path | None = None, *, in_place: bool = False, show: Show = unseen) -> Recovery:
-    """Write what is intact in `path` to `out` (by default beside it), or put it in its place.
+    """Write what is intact in `path` to `out`, by default beside it; with `in_place`, replace `path`.
 
     In place, a file from which something is lost is kept as `*.damaged-1`. RecordError when nothing can be read, when
     the result cannot be written, or when a process still writes the file.
     """
-    with closing(held(path)):
+    with closing(locked(path)):
         found = survey(path, show)
         if found.finished and found.whole and not found.notes:
             return Recovery(path, None, found)
         target = finished_name(path) if in_place else out or recovered_name(path)
         if os.path.lexists(target) and not (in_place and target == path):
-            mend = "remove the one that you do not want" if in_place else "choose another --out, or remove it"
-            raise RecordError(f"{target} exists already: {mend}")
+            fix = "remove the one that you do not want" if in_place else "choose another --out, or remove it"
+            raise RecordError(f"{target} exists already: {fix}")
 
-        def before_it_is_replaced(_new: Path) -> None:
+        def keep_original(_new: Path) -> None:
             if in_place and not found.whole:
-                keep(path)
+                keep_damaged(path)
 
         items = chain(_mark(found), salvage(path, "writing what is intact in", show)[1])
-        rewrite.write(target, JournalConfig().chunk, found.profile, items, before_it_is_replaced)
+        rewrite.write(target, JournalConfig().chunk, found.profile, items, keep_original)
         if in_place and target != path:
             path.unlink()
     return Recovery(path, target, found)
 
 
-def held(path: Path) -> IO[bytes]:
-    """The file, kept from being written by others until it is closed."""
+def locked(path: Path) -> IO[bytes]:
+    """Open a file and lock it against writers until it is closed. NoLogError when it cannot be read."""
     try:
-        file: IO[bytes] = disk.open_held(path, "rb")
+        file: IO[bytes] = disk.open_locked(path, "rb")
     except OSError as error:
         raise NoLogError(f"{path} cannot be read ({error.strerror}): check the path of the log") from None
     return file
 
 
 def survey(path: Path, show: Show) -> Findings:
-    """Read all of a file; NoLogError when there is nothing intact in it."""
+    """Read all of a file and return the findings; NoLogError when nothing in it is intact."""
     found, items = salvage(path, "reading", show)
     intact = sum(1 for _ in items)
     if not intact and not (found.finished and found.whole):
-        raise NoLogError(f"{path} holds nothing that is intact: it is no MCAP file, or damaged all over")
+        raise NoLogError(
+            f"{path} holds nothing that is intact: it is not an MCAP file, or it is damaged from begin to end"
+        )
     return found
 
 
-def keep(path: Path) -> Path:
-    """Keep a damaged file under another name, which is returned: there may be more in it than we can read."""
+def keep_damaged(path: Path) -> Path:
+    """Keep a damaged file under another name and return that: it may hold more than Overfly can read."""
     names = (path.with_name(f"{path.name}.damaged-{n}") for n in count(1))
     kept = next(name for name in names if not name.exists())
     kept.hardlink_to(path)
@@ -120,7 +117,7 @@ def keep(path: Path) -> Path:
 
 
 def _mark(found: Findings) -> Iterator[Item]:
-    """Tells readers that messages are missing, and how many are known to be; nothing where nothing is lost."""
+    """Yield metadata on what is lost, for the readers; nothing where nothing is lost."""
     if not found.whole:
         facts = {"lost": "; ".join(losses(found)), "messages_missing": str(found.missing)}
         yield Metadata(name=RECOVERED, metadata=facts)

@@ -1,4 +1,4 @@
-"""Writes what a log holds anew: beside it, and under its name only once all of it is on the disk."""
+"""Write a log again: beside the old one, which it replaces only once all of it is on the disk."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from tmc.record.mcap.writer import mcap_writer
 
 
 def write(
-    path: Path, chunk: int, profile: str, items: Iterable[Item], check: Callable[[Path], None] = lambda _: None
+    path: Path, chunk_bytes: int, profile: str, items: Iterable[Item], check: Callable[[Path], None] = lambda _: None
 ) -> int:
-    """Make `path` a finished file of these items, in chunks of `chunk` bytes before compression; returns its size.
+    """Write `path` as a finished file of these items, in chunks of `chunk_bytes` before compression; return its size.
 
-    An older file of that name is replaced in one step, once `check` of the new one raised nothing. RecordError when it
-    cannot be written; nothing of it is left then.
+    An older file of that name is replaced in one step, after `check` of the new one raised nothing. RecordError when it
+    cannot be written; then no part of it is left.
     """
-    new = path.with_name(path.name + ".new")
+    new = path.with_name(path.name + disk.NEW_SUFFIX)
     try:
-        with disk.open_held(new, "wb") as file:
+        with disk.open_locked(new, "wb") as file:
             try:
-                size = _fill(file, chunk, profile, items)
+                size = _fill(file, chunk_bytes, profile, items)
                 check(new)
                 new.replace(path)
             except BaseException:
@@ -40,15 +40,15 @@ def write(
         disk.sync_folder(path.parent)
     except OSError as error:
         why = f"the disk that holds {path} is full: free some space, and try again"
-        raise RecordError(why if error.errno in disk.FULL else disk.unwritable(path, error)) from None
+        raise RecordError(why if error.errno in disk.DISK_FULL else disk.why_unwritable(path, error)) from None
     return size
 
 
-def _fill(file: IO[bytes], chunk: int, profile: str, items: Iterable[Item]) -> int:
-    copy = _Copy(mcap_writer(file, chunk))
+def _fill(file: IO[bytes], chunk_bytes: int, profile: str, items: Iterable[Item]) -> int:
+    copy = _Copy(mcap_writer(file, chunk_bytes))
     copy.writer.start(profile=profile)
     for item in items:
-        copy.take(item)
+        copy.write(item)
     copy.writer.finish()
     file.flush()
     os.fsync(file.fileno())
@@ -56,15 +56,15 @@ def _fill(file: IO[bytes], chunk: int, profile: str, items: Iterable[Item]) -> i
 
 
 class _Copy:
-    """Takes items into a writer. Schemas and channels keep their order, and are numbered anew."""
+    """Copy items to a writer. Schemas and channels keep their order and get new numbers."""
 
     def __init__(self, writer: Writer) -> None:
         self.writer = writer
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
 
-    def take(self, item: Item) -> None:
-        """Write the messages of a chunk, metadata, or an attachment, as they are."""
+    def write(self, item: Item) -> None:
+        """Write the messages of a chunk, metadata, or an attachment, unchanged."""
         if isinstance(item, Metadata):
             self.writer.add_metadata(item.name, item.metadata)
         elif isinstance(item, Attachment):
@@ -72,7 +72,7 @@ class _Copy:
             self.writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
         else:
             for m in item:
-                channel = self._channels.get(m.channel.id) or self._channel(m.channel, m.schema)
+                channel = self._channels.get(m.channel.id) or self._channel(m.channel, m.definition)
                 self.writer.add_message(channel, m.log_time, m.data, m.publish_time, m.sequence)
 
     def _channel(self, channel: Channel, schema: Schema | None) -> int:

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from tmc.kernel.config import JournalConfig
 from tmc.record import schemas
 from tmc.record.errors import RecordError
-from tmc.record.mcap.compact import CHUNK, compact_run
+from tmc.record.mcap.compact import CHUNK_BYTES, compact_run
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
@@ -80,7 +80,7 @@ def test_large_logs_get_chunks_of_four_mebibytes(tmp_path: Path) -> None:
         summary = make_reader(stream).get_summary()
         assert summary is not None
         sizes = [chunk.uncompressed_size for chunk in summary.chunk_indexes]
-    assert len(sizes) == 2 and sizes[0] > CHUNK
+    assert len(sizes) == 2 and sizes[0] > CHUNK_BYTES
 
 
 def test_a_torn_end_is_dropped_and_said(run: Path) -> None:

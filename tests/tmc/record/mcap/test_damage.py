@@ -265,7 +265,7 @@ def test_a_lost_chunk_is_counted_and_what_stands_behind_it_is_kept(wholes: dict[
     assert [(lost.at, lost.bytes) for lost in result.found.lost] == [(begin, end - begin)]
     said = [*result.lines()]
     assert said[1].startswith(f"  lost {end - begin:,} bytes from byte {begin:,} (")
-    assert said[2] == "  lost 6 messages, as the numbers of the others tell"
+    assert said[2] == "  lost 6 messages, by the gaps in the numbers of the others"
     assert f"{end - begin:,} bytes from byte" in Log(result.out).lost["lost"]
 
 
@@ -291,7 +291,7 @@ def test_topics_that_only_a_lost_chunk_described_are_not_guessed(wholes: dict[bo
 def test_a_damaged_summary_is_made_anew_and_nothing_is_lost(wholes: dict[bool, Whole], tmp_path: Path) -> None:
     for data in (wholes[True].data[:-30], wholes[True].data[:-30] + bytes(30), wholes[True].data + b"more"):
         result = recover(write(tmp_path, wholes[True], data), tmp_path / f"{len(data) % 97}.mcap")
-        assert result.clean and "summary is damaged or cut, and made anew" in "\n".join(result.lines())
+        assert result.clean and "summary is damaged or cut: it is written again" in "\n".join(result.lines())
         assert result.out is not None and messages_of(result.out) == wholes[True].messages
         result.out.unlink()
 
@@ -334,7 +334,7 @@ def test_a_recovered_log_is_resumed_with_its_gap(wholes: dict[bool, Whole], tmp_
 def test_what_cannot_be_recovered_is_said_and_leaves_nothing(wholes: dict[bool, Whole], tmp_path: Path) -> None:
     text = tmp_path / "text.mcap"
     text.write_text("hello, world, this is no log at all; " * 100)
-    with pytest.raises(RecordError, match="holds nothing that is intact: it is no MCAP file"):
+    with pytest.raises(RecordError, match="holds nothing that is intact: it is not an MCAP file"):
         recover(text)
     with pytest.raises(RecordError, match=r"cannot be read \(No such file"):
         recover(tmp_path / "gone.mcap")

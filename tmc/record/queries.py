@@ -1,7 +1,7 @@
-"""Facts of a run, typed, from `tmc.mcap` alone: who was where, how uncertain the map was, which events appeared.
+"""Query a run, from `tmc.mcap` alone: the cells of the UAVs, the uncertainty of the true map, and the events.
 
 Delivery is at least once and services restart, so repeats are dropped here. A log that contradicts itself is refused.
-Of a damaged log these are the facts before the damage: `Log.damage` tells.
+A damaged log is read up to the damage, which `Log.damage` reports.
 """
 
 from __future__ import annotations
@@ -17,31 +17,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmc.record.errors import RecordError
-from tmc.record.reader import Log, decode, run_files
+from tmc.record.reader import Log, decode
+from tmc.record.run_folder import tmc_log
 
 Folder = str | os.PathLike[str]
 _UNKNOWN = -1
 
 
-def _messages(folder: Folder, *schemas: str) -> Iterator[Any]:
-    """All messages of these schemas in tmc.mcap, in the order of the log."""
-    files = run_files(folder)
-    if "tmc" not in files:
-        raise RecordError(f"{folder} holds no tmc.mcap: give the folder of the run on the host where the TMC ran")
-    for raw in Log(files["tmc"]).raw():
+def messages(folder: Folder, *schemas: str) -> Iterator[Any]:
+    """Yield the messages of these schemas in tmc.mcap, in the order of the log."""
+    for raw in Log(tmc_log(folder)).raw():
         if raw.schema in schemas:
             yield decode(raw)
 
 
 class Tracks:
-    """The cells of all UAVs in one episode, tick by tick: four bytes a move."""
+    """The cells of all UAVs in one episode, tick by tick. Memory: four bytes per move."""
 
     def __init__(self, episode: int) -> None:
         self.episode = episode
         self._cells: dict[int, array[int]] = {}
 
     def add(self, record: Any) -> None:
-        """Take in an overfly.FlightRecord; RecordError when it puts a UAV where it was not."""
+        """Add an overfly.FlightRecord; RecordError when it contradicts the cells of an earlier one."""
         cells = self._cells.setdefault(record.uav, array("i"))
         new, first = record.cells[:], record.first
         cells.extend([_UNKNOWN] * (first + len(new) - len(cells)))
@@ -54,7 +52,7 @@ class Tracks:
             cells[tick] = cell
 
     def rows(self) -> NDArray[np.uint32]:
-        """Shape (moves, 3): tick, uav, cell, in order of tick and uav."""
+        """Return (tick, uav, cell) in order of tick and uav; shape (moves, 3), uint32."""
         parts = [np.zeros((0, 3), np.int64)]
         for uav, track in sorted(self._cells.items()):
             cells = np.array(track, np.int64)
@@ -65,10 +63,10 @@ class Tracks:
 
 
 def tracks(folder: Folder) -> dict[int, Tracks]:
-    """{episode: tracks} of all flight records, in order of the episodes; a (uav, sequence) counts once."""
+    """Return {episode: tracks} of all flight records, in order of the episodes. A (uav, sequence) counts once."""
     found: dict[int, Tracks] = {}
     known: dict[int, set[int]] = defaultdict(set)
-    for record in _messages(folder, "overfly.FlightRecord"):
+    for record in messages(folder, "overfly.FlightRecord"):
         if record.sequence not in known[record.uav]:
             known[record.uav].add(record.sequence)
             found.setdefault(record.episode, Tracks(record.episode)).add(record)
@@ -76,56 +74,56 @@ def tracks(folder: Folder) -> dict[int, Tracks]:
 
 
 def moves(folder: Folder, episode: int) -> Iterator[tuple[int, int, int]]:
-    """(tick, uav, cell) for ticks 0..T, in order of tick and uav."""
+    """Return (tick, uav, cell) for ticks 0..T, in order of tick and uav. RecordError for an unknown episode."""
     found = tracks(folder)
-    _check_held(folder, episode, found)
+    _check_known(folder, episode, found)
     return ((t, uav, cell) for t, uav, cell in found[episode].rows().tolist())
 
 
 def digest(folder: Folder) -> str:
-    """SHA-256 of what was flown: (episode, tick, uav, cell) as little-endian uint32, in that order of sorting.
+    """Return the SHA-256 (hex) of all (episode, tick, uav, cell), sorted, as little-endian uint32.
 
-    Two runs with the same digest flew exactly the same.
+    Two runs with the same digest flew the same cells at the same ticks.
     """
     sha = hashlib.sha256()
-    for episode, flown in tracks(folder).items():
-        rows = flown.rows()
+    for episode, found in tracks(folder).items():
+        rows = found.rows()
         sha.update(np.insert(rows, 0, episode, axis=1).astype("<u4").tobytes())
     return sha.hexdigest()
 
 
 def uncertainty(folder: Folder, episode: int) -> Iterator[tuple[int, float]]:
-    """(tick, sum over cells of the uncertainty of the true map), in order of tick."""
+    """Return (tick, sum over cells of the uncertainty of the true map), in order of tick. Raises RecordError."""
     values: dict[int, dict[int, float]] = defaultdict(dict)
-    for m in _messages(folder, "overfly.TeamMetrics"):
+    for m in messages(folder, "overfly.TeamMetrics"):
         values[m.episode].update(enumerate(m.uncertainty[:], start=m.first))
-    _check_held(folder, episode, values)
+    _check_known(folder, episode, values)
     return iter(sorted(values[episode].items()))
 
 
 def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
-    """(tick, cell) of each event of scenario I, in that order; none in scenario II."""
+    """Return (tick, cell) of each event of scenario I, in that order; nothing in scenario II. Raises RecordError."""
     found: dict[int, set[tuple[int, int]]] = defaultdict(set)
-    for m in _messages(folder, "overfly.Events", "overfly.Episode"):
-        held = found[m.episode]
+    for m in messages(folder, "overfly.Events", "overfly.Episode"):
+        events_found = found[m.episode]
         if m.DESCRIPTOR.name == "Events":
-            held.update(zip(m.ticks[:], m.cells[:], strict=True))
-    _check_held(folder, episode, found)
+            events_found.update(zip(m.ticks[:], m.cells[:], strict=True))
+    _check_known(folder, episode, found)
     return iter(sorted(found[episode]))
 
 
 def episodes(folder: Folder) -> list[Any]:
-    """The overfly.Episode messages, in the order of the log."""
-    return list(_messages(folder, "overfly.Episode"))
+    """Return the overfly.Episode messages, in the order of the log."""
+    return list(messages(folder, "overfly.Episode"))
 
 
-def _check_held(folder: Folder, episode: int, held: Collection[int]) -> None:
-    if episode not in held:
-        raise RecordError(f"{folder} holds nothing of episode {episode}: ask for one of {_ranges(held)}")
+def _check_known(folder: Folder, episode: int, known: Collection[int]) -> None:
+    if episode not in known:
+        raise RecordError(f"{folder} holds nothing of episode {episode}: ask for one of {_ranges(known)}")
 
 
 def _ranges(numbers: Collection[int]) -> str:
-    """Numbers in words: `1 to 3, 7`."""
+    """Return numbers in words: `1 to 3, 7`."""
     spans: list[list[int]] = []
     for n in sorted(numbers):
         if spans and n == spans[-1][1] + 1:
