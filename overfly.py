@@ -197,8 +197,8 @@ def fly(
 
     extras.require()
     pilot = policy_spec.resolve(os.fspath(who), _say(quiet))
-    values = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **_values("fly", settings)}
-    world = mission.check(build(values | policy_spec.pilot_of(pilot)), pilot.policy, pilot.name)
+    config = build(policy_spec.mission_values(pilot, _values("fly", settings)))
+    world = mission.check(config, pilot.policy, pilot.name)
     return _fly(
         world,
         _path(out),

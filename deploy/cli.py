@@ -9,9 +9,11 @@ import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from tmc.wire import process
 from tmc.wire.options import Options
@@ -43,7 +45,7 @@ COMMANDS: tuple[Command, ...] = (
 
 
 def mistakes() -> tuple[type[Exception], ...]:
-    """The errors that are the user's to mend: one sentence and exit code 2."""
+    """The errors that are the user's to fix: one sentence and exit code 2."""
     from tmc.kernel.config import ConfigError  # noqa: PLC0415  the command starts without NumPy
     from tmc.kernel.policy import PolicyError  # noqa: PLC0415
     from tmc.kernel.roadmap import MapError  # noqa: PLC0415
@@ -101,12 +103,15 @@ def _folder_of(name: str, depth: int) -> str:
     return str(Path(spec.origin).resolve().parents[depth - 1]) if spec and spec.origin else f"no {name}"
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
+def main(argv: list[str] | None = None, trial: Mapping[str, Any] | None = None) -> int:
+    """Run one command; returns the exit code.
+
+    `trial`: settings `trial.*` of the mission. They stall UAVs or lose data by design, so no option sets them.
+    """
     process.standard_streams()
     process.inherited_signals()
     try:
-        return _main(argv)
+        return _main(argv, trial or {})
     except Exception as error:
         from deploy import extras  # noqa: PLC0415  only where something is wrong
 
@@ -117,12 +122,13 @@ def main(argv: list[str] | None = None) -> int:
         return process.USAGE
 
 
-def _main(argv: list[str] | None) -> int:
+def _main(argv: list[str] | None, trial: Mapping[str, Any]) -> int:
     # While modules are imported nothing is worth an orderly end: Ctrl-C ends the process, without a traceback.
     process.handle(signal.SIGINT, signal.SIG_DFL)
     argv = sys.argv[1:] if argv is None else argv
     chosen = next((a for a in argv if not a.startswith("-")), None)
     args = parser_for(chosen).parse_args(argv)
+    args.trial = dict(trial)
     module = importlib.import_module(next(c.module for c in COMMANDS if c.name == args.command))
 
     def run() -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,14 @@ from tmc.kernel.files import plain
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.policy import PolicyCard, PolicyError
 from tmc.kernel.roadmap import builtin_maps
+from tmc.kernel.text import nearest, suggestion
 from tmc.kernel.world import World
 from tmc.record.run_folder import RunFolder
 from tmc.wire import process
 from tmc.wire.capacity import check_policy
+
+KNOWN = tuple(PREFIX + name for name in PLANNERS)
+"""The planners as a policy spec names them."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +42,14 @@ def resolve(name: str, say: Callable[[str], None] = process.tell) -> PolicySpec:
     """
     if name.startswith(PREFIX):
         if name.removeprefix(PREFIX) not in PLANNERS:
-            raise ConfigError(f"there is no planner '{name}': choose {', '.join(PREFIX + p for p in PLANNERS)}")
+            raise ConfigError(f"there is no planner '{plain(name, 60)}': {suggestion(name, KNOWN)}")
         return PolicySpec(name, None, {"team.controller": name})
     try:
         is_folder = stat.S_ISDIR(Path(name).stat().st_mode)
     except (OSError, ValueError):  # nothing of that name, or a name that nothing can have
-        known = ", ".join(PREFIX + p for p in PLANNERS)
-        text = f"'{plain(name)}' is no policy file and no run folder: write one of these, or {known}"
-        raise ConfigError(text) from None
+        near = nearest(PREFIX + name, KNOWN) or nearest(name, KNOWN)
+        fix = f"did you mean {near}?" if near else f"write one of these, or {', '.join(KNOWN)}"
+        raise ConfigError(f"'{plain(name)}' is not a policy file, a run folder or a planner: {fix}") from None
     if is_folder:
         return _of_run(Path(name), say)
     return _of_file(name, Path(name), {})
@@ -100,13 +104,22 @@ def view_of(card: PolicyCard) -> dict[str, Any]:
     }
 
 
-def pilot_of(who: PolicySpec) -> dict[str, Any]:
-    """The one setting that WHO decides, whatever else is set."""
-    return {"team.controller": who.values["team.controller"]}
-
-
 FIXED = {"exploration.start": 0.0, "exploration.end": 0.0}
 """A fixed policy flies as it is, without exploration."""
+ONE_EPISODE: Mapping[str, Any] = {"training.episodes": 1, **FIXED}
+"""What a mission of a fixed policy has in place of the defaults."""
+
+
+def mission_values(spec: PolicySpec, *more: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge the settings of a mission that a policy spec flies, without learning.
+
+    First come those that the spec brings along, then one episode without exploration, then `more`, of which the later
+    ones win. Only what flies is always the spec's.
+    """
+    merged = {**spec.values, **ONE_EPISODE}
+    for values in more:
+        merged |= values
+    return merged | {"team.controller": spec.values["team.controller"]}
 
 
 def require_policy(model: bytes, world: World, name: str) -> None:

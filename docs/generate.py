@@ -40,7 +40,7 @@ GROUPS = {
     "replay": "Replay",
     "training": "Training",
     "journal": "Journal",
-    "trial": "Trials",
+    "trial": "Trials, which only overfly verify sets",
 }
 """Titles of the groups of settings; a group that is not listed has its own name."""
 
@@ -82,9 +82,7 @@ def arguments(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
             written = action.option_strings[-1] if action.nargs == 0 else f"{action.option_strings[-1]} {name}"
         else:
             written = {"?": f"[{name}]", "+": f"{name}..."}.get(str(action.nargs), name)
-        about = formatter._expand_help(action) if action.help else ""
-        setting = SETTINGS.get(about)
-        yield written, f"setting `{about}`: {setting.about}" if setting else about
+        yield written, formatter._expand_help(action) if action.help else ""
 
 
 def command_section(parser: argparse.ArgumentParser, name: str, depth: int) -> Iterator[str]:

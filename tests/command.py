@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -17,10 +18,17 @@ LINE = (sys.executable, "-P", "-m", "deploy.cli")
 """How `overfly` is started, whatever lies in the folder that it is started in."""
 
 
-def overfly(*args: object, cwd: Path, timeout: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
-    """`overfly ARGS` in a process of its own."""
-    line = [*LINE, *map(str, args)]
+def overfly(
+    *args: object, cwd: Path, timeout: float = PATIENCE_S, line: tuple[str, ...] = LINE
+) -> subprocess.CompletedProcess[str]:
+    """`overfly ARGS` in a process of its own, started by `line`."""
+    line = (*line, *map(str, args))
     return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=timeout, check=False)
+
+
+def line_of_trial(**trial: object) -> tuple[str, ...]:
+    """How `overfly` is started with settings `trial.*`, given without their group: `stall=0.01`."""
+    return (sys.executable, "-P", str(Path(__file__).with_name("trial.py")), json.dumps(trial))
 
 
 def descendants(process: int) -> list[int]:

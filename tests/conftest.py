@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.command import overfly
+from tests.command import line_of_trial, overfly
 
 PATIENT = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("overfly", derandomize=True, **PATIENT)
@@ -36,8 +36,7 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 TRAINED = ("run", "quick", "--ticks", 60, "--episodes", 2, "--no-pictures",
-           *(word for change in ("replay.learn_start=60", "dqn.batch_size=16", "journal.flush_interval=0.1",
-                                 "trial.observation_hash=true")
+           *(word for change in ("replay.learn_start=60", "dqn.batch_size=16", "journal.flush_interval=0.1")
              for word in ("--set", change)))  # fmt: skip
 
 
@@ -76,7 +75,8 @@ def trained(once: Once) -> Callable[[int], Path]:
 
     def train(scenario: int) -> Path:
         def make(folder: Path) -> None:
-            done = overfly(*TRAINED, "--scenario", scenario, "--out", "R", cwd=folder)
+            line = line_of_trial(observation_hash=True)
+            done = overfly(*TRAINED, "--scenario", scenario, "--out", "R", cwd=folder, line=line)
             assert done.returncode == 0, done.stderr
 
         return once(f"trained-{scenario}", make) / "R"

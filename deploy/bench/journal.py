@@ -74,8 +74,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
     if not args.dir.is_dir():
         raise ConfigError(f"--dir {args.dir} is not a folder: choose one on the disk that runs are written to")
     pilot = policy_spec.resolve("planner:greedy")
-    first = {"team.size": 10, "training.episodes": 1}
-    world = check(build({**pilot.values, **first, **policy_spec.FIXED, **settings.chosen(args)}))
+    world = check(build(policy_spec.mission_values(pilot, {"team.size": 10}, settings.chosen(args))))
     bounds.missions(world)
     with tempfile.TemporaryDirectory(prefix="overfly-bench-", dir=args.dir) as scratch:
         folder = Path(scratch)

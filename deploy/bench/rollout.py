@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def measure(args: argparse.Namespace) -> list[Row]:
     """Fly all missions; return one row per figure. Raises ConfigError."""
     pilot = policy_spec.resolve(args.who)
-    values = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
+    values = policy_spec.mission_values(pilot, settings.chosen(args))
     bounds.number("--repeats", args.repeats, 1, MISSION_S)
     sizes = [n for n in team_sizes(args.actors) if n is not None]
     worlds = [check(build({**values, "team.size": n}), pilot.policy) for n in sizes]

@@ -31,7 +31,9 @@ ANSWER_S, START_S = 10, 60
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("--settings", action="store_true", help="list every setting with its default and source")
+    parser.add_argument(
+        "--settings", action="store_true", help="list every setting with its value, range, unit and source"
+    )
     parser.add_argument(
         "--preset",
         default="paper",
@@ -167,8 +169,8 @@ CHECKS: dict[str, Callable[[Config], str]] = {
 
 def _settings(preset: str) -> int:
     values = flat(settings.config_for(preset, {}))
-    for key, s in SETTINGS.items():
-        unit = f" {s.unit}" if s.unit else ""
-        source = f" [{s.source}]" if s.source else ""
-        print(f"{key} = {values[key]}{unit}\n    {s.about}{source}")
+    for key, setting in SETTINGS.items():
+        source = f" [{setting.source}]" if setting.source else ""
+        source = " [set by `overfly verify` alone]" if setting.trial else source
+        print(f"{key} = {values[key]}\n    {settings.sentence(setting)}{source}")
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 import overfly
-from deploy import settings
+from deploy import policy_spec, settings
 from deploy.commands.analyze import report
 from deploy.commands.run import add_mission_options
 from deploy.run import mission
@@ -14,7 +14,7 @@ from deploy.run import mission
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("who", help="policy file, run folder, or planner:random, planner:random-road, planner:greedy")
-    settings.add_options(parser)
+    settings.add_options(parser, defaults=policy_spec.ONE_EPISODE)
     add_mission_options(parser)
 
 

@@ -9,7 +9,7 @@ from deploy import extras, policy_spec, settings
 from deploy.run import machine, mission
 from deploy.run.progress import Progress
 from tmc.__main__ import serve
-from tmc.kernel.config import Config, ConfigError, build, flat
+from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import compact_log
@@ -39,15 +39,8 @@ def main(args: argparse.Namespace) -> int:
     policy, name = None, ""
     if args.fly:
         pilot = policy_spec.resolve(args.fly)
-        values = {
-            **flat(config),
-            **pilot.values,
-            "training.episodes": 1,
-            **policy_spec.FIXED,
-            **settings.chosen(args),
-            **policy_spec.pilot_of(pilot),
-        }
-        config, policy, name = build(values), pilot.policy, pilot.name
+        config = build(policy_spec.mission_values(pilot, settings.chosen(args)), config)
+        policy, name = pilot.policy, pilot.name
     world = mission.check(config, policy, name)
     learns = policy is None and not policy_spec.is_planner(config)
     if not name:

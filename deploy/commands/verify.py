@@ -18,7 +18,7 @@ from deploy.run.line import Line
 from deploy.run.mission import check, new_folder
 from deploy.run.progress import clock
 from deploy.verify import asynchrony, exactness
-from tmc.kernel.config import Config, ConfigError
+from tmc.kernel.config import SETTINGS, Config, ConfigError
 from tmc.wire import process
 
 PHASES = ("together", "staggered")
@@ -26,7 +26,7 @@ PHASES = ("together", "staggered")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="WHAT")
+    kinds = parser.add_subparsers(dest="check", required=True, metavar="CHECK")
     about = "fly missions as processes and in lock step, and compare every fact of their logs"
     exact = kinds.add_parser("exactness", help=about, description=about)
     exact.add_argument("--actors", dest="teams", default="1,2,3,10", metavar="N[,N...]", help="default: %(default)s")
@@ -35,8 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     exact.add_argument("--phases", default=",".join(PHASES), metavar="P[,P]", help="default: %(default)s")
     exact.add_argument("--seeds", type=int, default=1, metavar="S", help="missions of each kind (default: 1)")
     exact.add_argument("--stalls", action="store_true", help="stall the UAVs at random ticks for some milliseconds")
-    exact.add_argument("--ticks", metavar="T", help="training.ticks")
-    exact.add_argument("--map", metavar="NAME", help="world.map")
+    ticks, world = (settings.help_of(SETTINGS[key], SETTINGS[key].default) for key in ("training.ticks", "world.map"))
+    exact.add_argument("--ticks", metavar="T", help=ticks)
+    exact.add_argument("--map", metavar="NAME", help=world)
     _add_common(exact)
     about = "delay one UAV, and show how far the others run ahead of it, and what bounds them"
     asynchronous = kinds.add_parser("asynchrony", help=about, description=about)
@@ -60,7 +61,7 @@ def main(args: argparse.Namespace) -> int:
     """Verify; return exit code 1 if a check fails. Raises ConfigError."""
     extras.require()
     try:
-        return MAINS[args.kind](args)
+        return MAINS[args.check](args)
     except exactness.MissionAborted as aborted:
         process.tell(str(aborted))
         return process.FAILED
@@ -119,12 +120,12 @@ def _configs(args: argparse.Namespace) -> tuple[list[Config], bytes | None]:
     if args.seeds < 1:
         raise ConfigError("--seeds must be 1 or more")
     pilot = policy_spec.resolve(args.who)
-    base = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **(exactness.STALLS if args.stalls else {})}
+    stalls = exactness.STALLS if args.stalls else {}
+    base = policy_spec.mission_values(pilot, stalls, settings.chosen(args))
     teams, scenarios, periods = (
         [int(item) for item in listed(option, text)]
         for option, text in (("--actors", args.teams), ("--scenarios", args.scenarios), ("--tu", args.periods))
     )
-    base |= settings.chosen(args)
     phases = listed("--phases", args.phases, PHASES)
     configs = exactness.combinations(base, teams, scenarios, periods, phases, args.seeds)
     for config in configs:
@@ -162,7 +163,7 @@ def _asynchrony(args: argparse.Namespace) -> int:
     if args.actors < 2 or args.hold <= 0:
         raise ConfigError("--actors must be 2 or more, and --hold more than 0, so that one UAV can be ahead of another")
     pilot = policy_spec.resolve(args.who)
-    base = {**pilot.values, "training.episodes": 1, **policy_spec.FIXED, **settings.chosen(args)}
+    base = policy_spec.mission_values(pilot, settings.chosen(args))
     if not args.json:
         print(f"{args.actors} UAVs, one of them delayed by {args.hold * 1000:g} ms per tick\n\n{asynchrony.HEAD}")
     line, passed = Line(), True

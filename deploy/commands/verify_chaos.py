@@ -19,7 +19,7 @@ from deploy.verify.chaos import trial
 from deploy.verify.chaos.faults import CUT, POWER, STOP, Fault, draw_faults
 from deploy.verify.chaos.schedule import FaultSchedule
 from tmc.center.roster import LEARNER, uav_name
-from tmc.kernel.config import Config, ConfigError, build
+from tmc.kernel.config import Config, ConfigError
 from tmc.wire import process
 
 ABOUT = "kill, stop and cut off the processes of a mission at random, and check that nothing was lost or doubled"
@@ -87,8 +87,8 @@ def _config(args: argparse.Namespace) -> tuple[Config, bytes | None]:
         config = settings.config_for(args.preset or "quick", {**trial.TRAIN, **more, **settings.chosen(args)})
         return config, None
     pilot = policy_spec.resolve(args.who)
-    base = settings.config_for(args.preset or "paper", {**pilot.values, **policy_spec.FIXED, **trial.FLY, **more})
-    return build({**settings.chosen(args), **policy_spec.pilot_of(pilot)}, base), pilot.policy
+    values = policy_spec.mission_values(pilot, trial.FLY, more, settings.chosen(args))
+    return settings.config_for(args.preset or "paper", values), pilot.policy
 
 
 def _faults(args: argparse.Namespace, config: Config) -> list[Fault]:

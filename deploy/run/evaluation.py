@@ -111,10 +111,8 @@ def missions(
     shared = shared_world(pilots, {*chosen, *(["team.size"] if teams else [])})
     for pilot in pilots:
         for n in sizes:
-            values = {**pilot.values, **shared, "training.episodes": 1, **policy_spec.FIXED, **chosen}
-            values |= policy_spec.pilot_of(pilot)
-            values |= {} if n is None else {"team.size": n}
-            config = build(values)
+            size = {} if n is None else {"team.size": n}
+            config = build(policy_spec.mission_values(pilot, shared, chosen, size))
             check(config, pilot.policy, pilot.name)
             for seed in seeds:
                 yield pilot.name, build({"training.seed": seed}, config), pilot.policy

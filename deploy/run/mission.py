@@ -23,7 +23,9 @@ from deploy.run.supervisor import MissionFailed, Supervisor
 from tmc.analysis.run_config import attachments, settings_of
 from tmc.kernel import files, forecast
 from tmc.kernel.config import Config, ConfigError, flat
+from tmc.kernel.files import plain
 from tmc.kernel.policy import FlightError, check_view, view_shape
+from tmc.kernel.text import suggestion
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World, world_of_run
 from tmc.record import disk
@@ -69,8 +71,9 @@ def check(config: Config, policy: bytes | None = None, name: str = "the policy")
     `name`: what messages call the policy.
     """
     if config.team.controller != "policy" and config.team.controller.removeprefix(PREFIX) not in PLANNERS:
-        known = ", ".join(PREFIX + name for name in PLANNERS)
-        raise ConfigError(f"team.controller = {config.team.controller} is neither policy nor {known}")
+        name = plain(config.team.controller, 60)
+        fix = suggestion(name, ("policy", *policy_spec.KNOWN))
+        raise ConfigError(f"team.controller = {name} is neither policy nor a planner: {fix}")
     world = World(config)
     _check(world, policy, name)
     return world

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from tests.command import LINE, PATIENCE_S, descendants, here, overfly
+from tests.command import PATIENCE_S, descendants, here, line_of_trial, overfly
 from tmc.kernel.config import JournalConfig
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
@@ -20,9 +20,9 @@ from tmc.record.writer import LogWriter
 
 FLOWN = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures")
 # Slow enough to be still in flight when all have written.
-KILLED = ("run", "quick", "--actors", "2", "--set", "trial.stall=0.01", "--set", "replay.learn_start=60",
+KILLED = ("run", "quick", "--actors", "2", "--set", "replay.learn_start=60",
           "--set", "dqn.batch_size=16", "--set", "journal.flush_interval=0.1")  # fmt: skip
-LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures", "--set", "trial.stall=0.06",
+LOSING = ("fly", "planner:greedy", "--actors", "2", "--ticks", "60", "--no-pictures",
           "--set", "comms.silence_warning=0.5", "--set", "comms.lost_after=1",
           "--set", "journal.flush_interval=0.1")  # fmt: skip
 CHUNK = 0x06
@@ -103,7 +103,7 @@ def _copies(left: Path, folder: Path) -> list[Path]:
 
 def lose_one(out: Path) -> None:
     """Fly a mission in which one of two UAVs is silent for so long that the other flies on without it."""
-    with subprocess.Popen([*LINE, *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
+    with subprocess.Popen([*line_of_trial(stall=0.06), *LOSING, "--out", str(out)], stdout=subprocess.DEVNULL) as run:
         _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in ("tmc", "uav-001")])
         (silent,) = (
             p for p in descendants(run.pid) if b"actors --id 1 " in (Path("/proc") / str(p) / "cmdline").read_bytes()
@@ -116,7 +116,7 @@ def lose_one(out: Path) -> None:
 
 def kill_in_flight(out: Path) -> None:
     """Kill supervisor, TMC, learner and UAVs once each of them has a message in its log."""
-    with subprocess.Popen([*LINE, *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
+    with subprocess.Popen([*line_of_trial(stall=0.01), *KILLED, "--out", str(out)], stderr=subprocess.DEVNULL) as run:
         try:
             _await_messages(run, [out / f"{name}.mcap{ACTIVE}" for name in WRITERS])
             time.sleep(0.5)

@@ -14,6 +14,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from tests.command import PATIENCE_S
 from tests.readers.conftest import Topic
+from tmc.record.channels import FORMAT
 from tmc.record.reader import Log
 
 MISSING = "needs pybag-sdk: pip install '.[readers]'"
@@ -54,7 +55,7 @@ def found(path: Path) -> dict[str, list[tuple[str, int, int, int, bytes]]]:
         assert {channel.message_encoding for channel in channels.values()} == {"protobuf"}
         assert reader.get_statistics().message_count == sum(map(len, topics.values()))
         assert reader.get_header().profile == "overfly"
-        assert any(record.metadata.get("format") == "1" for record in reader.get_metadata())
+        assert any(record.metadata.get("format") == FORMAT for record in reader.get_metadata())
     return topics
 
 

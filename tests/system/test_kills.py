@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import LINE, PATIENCE_S
+from tests.command import PATIENCE_S, line_of_trial
 from tmc.record.queries import digest
 
 
@@ -27,8 +27,7 @@ def test_a_uav_killed_at_up_to_ten_random_ticks_flies_the_same(
     # Every UAV stalls a little, so that the mission lasts longer than ten pauses before a kill, unless looking for the
     # process takes as long as on a machine with thousands of them.
     mission = ["fly", "planner:greedy", "--no-pictures", "--actors", "3", "--ticks", "600", "--seed", "7", *options]
-    slow = ["--set", "trial.stall=0.01", "--set", "trial.stall_share=1.0"]
-    command = [*LINE, *mission, *slow, "--out", str(out)]
+    command = [*line_of_trial(stall=0.01), *mission, "--out", str(out)]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
         while run.poll() is None and kills < 10:
             found = [p for p in running("actors --id 1 --connect ipc:///") if p in running(str(out))]

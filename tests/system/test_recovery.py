@@ -16,7 +16,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from deploy.cli import main
-from tests.command import LINE, PATIENCE_S
+from tests.command import LINE, PATIENCE_S, line_of_trial
 from tmc.analysis.invariants.check import check
 from tmc.center.journal import journal_in
 from tmc.kernel.config import JournalConfig
@@ -29,7 +29,7 @@ from tmc.record.writer import LogWriter
 Overfly = Callable[..., subprocess.CompletedProcess[str]]
 Running = Callable[[str], list[int]]
 FLIGHT = ("fly", "planner:greedy", "--actors", "3", "--ticks", "500", "--seed", "7", "--no-pictures")
-SLOW = ("--set", "trial.stall=0.01", "--set", "trial.stall_share=1.0")
+SLOW = line_of_trial(stall=0.01)
 """Every UAV stalls a little, so that the mission lasts long enough to be killed in."""
 
 
@@ -41,9 +41,10 @@ def reference_digest(tmp_path_factory: pytest.TempPathFactory) -> str:
     return digest(out)
 
 
-def begin(tmp_path: Path, *command: str) -> subprocess.Popen[str]:
-    line = [*LINE, *command]
-    return subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+def begin(tmp_path: Path, *command: str, line: tuple[str, ...] = LINE) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*line, *command], cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    )
 
 
 def wait_for(what: Callable[[], object], run: subprocess.Popen[str]) -> None:
@@ -83,7 +84,7 @@ def test_a_tmc_killed_at_five_random_ticks_flies_the_same(
     running: Running, reference_digest: str, tmp_path: Path
 ) -> None:
     out, draw, kills = tmp_path / "R", random.Random(5), 0
-    with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
+    with begin(tmp_path, *FLIGHT, "--out", str(out), line=SLOW) as run:
         while kills < 5:
             before = records(out)
             wait_for(lambda before=before: records(out) > before, run)
@@ -105,7 +106,7 @@ def test_a_flight_goes_on_after_everything_was_killed(
     overfly: Overfly, here: Overfly, running: Running, reference_digest: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "R"
-    with begin(tmp_path, *FLIGHT, *SLOW, "--out", str(out)) as run:
+    with begin(tmp_path, *FLIGHT, "--out", str(out), line=SLOW) as run:
         wait_for(lambda: records(out) > 40, run)
         busy = here("run", "--resume", out)
         assert busy.returncode == 2 and "is being written by another process: end that one first" in busy.stderr

@@ -10,8 +10,10 @@ from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, build, differences
 from tmc.kernel.roadmap import DEFAULT_CELL_M, MAP_COPY, MapError, RoadMap, map_of_run, parse_raster
 from tmc.kernel.world import World
+from tmc.record.channels import FORMAT
 from tmc.record.errors import RecordError
 from tmc.record.mcap.strict import DamageError, contents
+from tmc.record.reader import require_format
 from tmc.record.run_folder import RunFolder
 
 ATTACHED = frozenset(("config.json", "map.csv"))
@@ -49,11 +51,15 @@ def settings_of(folder: Path, tmc_log: Path | None) -> Settings:
 
 
 def attachments(tmc_log: Path) -> dict[str, str]:
-    """Return {name: text} of the attachments at the start of the log; nothing behind them is read."""
+    """Return {name: text} of the attachments at the start of the log; nothing behind them is read.
+
+    Raises RecordError for a log of another format.
+    """
     found: dict[str, str] = {}
     try:
         with tmc_log.open("rb") as file:
             for item in contents(file):
+                require_format(tmc_log, item)
                 name = getattr(item, "name", None)  # mcap's types are known to `record` only
                 if name in ATTACHED:
                     found[name] = getattr(item, "data", b"").decode("utf-8", errors="replace")
@@ -74,7 +80,8 @@ def _settings(folder: Path, attached: str | None) -> Settings:
     except FileNotFoundError:
         own = None
     except (OSError, *_NO_CONFIG) as error:
-        own, wrong = None, f"{path} is not the config of a run ({getattr(error, 'strerror', None) or error})"
+        reason = getattr(error, "strerror", None) or error
+        own, wrong = None, f"{path} is not the config of a run of log format {FORMAT} ({reason})"
     if logged is None:
         if own is None:
             raise RecordError(f"{wrong}, and its log holds none either: give the folder of a run")

@@ -20,6 +20,7 @@ from tmc.kernel import files as regular
 from tmc.kernel.grid import OFF_GRID, STAY, Grid
 from tmc.kernel.raster import UNREACHABLE, Georeference, components, flood
 from tmc.kernel.rastertext import BLOCKED, CELL_M, FREE, ROAD, MapError, parse_text, raster_text
+from tmc.kernel.text import nearest
 
 __all__ = [
     "MAP_COPY",
@@ -176,8 +177,9 @@ def _read(path: str) -> str:
         raw = regular.read_bytes(path, MAX_RASTER_BYTES + 1)
         text = raw.decode("utf-8-sig")
     except FileNotFoundError:
-        known = ", ".join(builtin_maps())
-        raise MapError(f"no map and no file is called '{shown}': use {known}, or the path of a text raster") from None
+        near = nearest(path, builtin_maps())
+        fix = f"did you mean {near}?" if near else f"use {', '.join(builtin_maps())}, or the path of a text raster"
+        raise MapError(f"no map and no file is called '{shown}': {fix}") from None
     except UnicodeDecodeError as error:
         raise MapError(f"{shown}: byte {error.start + 1} is not UTF-8: save the raster as plain text") from None
     except (OSError, ValueError) as error:  # a folder, a pipe, no permission, an impossible name

@@ -8,6 +8,8 @@ from functools import cached_property
 
 from tmc.record.errors import RecordError
 
+FORMAT = "2"
+"""Version of the log format, in the metadata of each file: raised when settings, topics or fields are renamed."""
 ACTIVE = ".active"
 """Appended to the name of a log while it is written."""
 EVERY = "every"

@@ -17,7 +17,7 @@ from tmc.record.errors import RecordError
 from tmc.record.mcap.export import Export
 from tmc.record.mcap.parser import Message
 from tmc.record.mcap.strict import DamageError, contents
-from tmc.record.reader import Log
+from tmc.record.reader import Log, require_format
 
 NAME = "overfly/merged"
 """The metadata record that only a merged file has."""
@@ -110,6 +110,7 @@ def _survey(process: str, path: Path) -> _Source:
     try:
         with open_log(path) as file:
             for item in contents(file):
+                require_format(path, item)
                 if isinstance(item, Attachment):
                     source.attachments.append(item)
                 elif isinstance(item, Metadata):

@@ -14,7 +14,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from tmc.record.channels import ACTIVE
+from tmc.record.channels import ACTIVE, FORMAT
 from tmc.record.disk import open_log
 from tmc.record.errors import NoLogError, RecordError
 from tmc.record.mcap.parser import MAGIC, RECOVERED, UNKNOWN_LENGTH, Message
@@ -35,7 +35,10 @@ class LogMessage:
 
 
 class Log:
-    """Read one log file. RecordError when it is missing, empty, or not MCAP; later damage is noted in `damage`."""
+    """Read one log file.
+
+    Raises RecordError when it is missing, empty, not MCAP, or of another log format; `damage` has all else.
+    """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -122,12 +125,22 @@ class Log:
             with open_log(self.path) as file:
                 for item in contents(file):
                     finished = item is None
+                    require_format(self.path, item)
                     yield item
         except DamageError as error:
             damage = error
             if error.size and intact_behind(self.path, error.at, error.size):
                 damage = DamageError(error.at, UNKNOWN_LENGTH)
         self._damage, self._finished, self._read = damage, finished, True
+
+
+def require_format(path: Path, item: list[Message] | Metadata | Attachment | None) -> None:
+    """Raise RecordError if an item of a log is metadata that states another version of the log format."""
+    if isinstance(item, Metadata) and item.name.startswith("overfly/"):
+        found = item.metadata.get("format", FORMAT)
+        if found != FORMAT and found.isdecimal():  # anything else is damage, which is noted as such
+            fix = "use the version of Overfly that wrote it"
+            raise RecordError(f"{path} was written in log format {found[:20]}, this version reads {FORMAT}: {fix}")
 
 
 def _check_start(path: Path) -> None:

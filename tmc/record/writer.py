@@ -26,9 +26,6 @@ from tmc.record.mcap.writer import mcap_writer
 from tmc.record.reader import Log
 from tmc.record.run_folder import active_name
 
-FORMAT = "1"
-"""Version of the log format, in the metadata of each file."""
-
 
 @dataclass(slots=True)
 class _Channel:
@@ -88,7 +85,7 @@ class LogWriter:
             if old is not None:
                 self._copy(old)
             # Names are unique per process, so that the files of a run can be merged.
-            facts = {"format": FORMAT, "process": self.process, "clock": "wall"}
+            facts = {"format": channels.FORMAT, "process": self.process, "clock": "wall"}
             self.note(f"overfly/{self.process}", facts | metadata)
             self.flush(fsync=old is not None)
             if old is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tmc.kernel.config import MAX_SIGHTINGS
 from tmc.wire import fields as f
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Version of the protocol. Frames of any other version are refused."""
 
 Array = NDArray[Any]

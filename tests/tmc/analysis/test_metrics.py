@@ -249,7 +249,7 @@ def test_without_config_json_the_log_has_it(fly, tmp_path):
     data = bytearray((folder / "tmc.mcap").read_bytes())
     data[data.index(b'"world.map"')] = ord("}")
     (folder / "tmc.mcap").write_bytes(data)
-    with pytest.raises(RecordError, match="is not the config of a run"):
+    with pytest.raises(RecordError, match="is not the config of a run of log format 2"):
         read(folder)
 
 

@@ -269,7 +269,7 @@ def test_the_file_holds_the_topics_of_the_table_in_order_of_time(flown: RunData)
     known = {(c.topic.replace("<id>", str(i)), c.schema) for c in REPLAY_CHANNELS
              for i in range(flown.world.config.team.size)}  # fmt: skip
     assert held == known
-    facts_ = {"clock": "simulated", "tick_seconds": "60", "process": "replay", "format": "1", "episode": "2"}
+    facts_ = {"clock": "simulated", "tick_seconds": "60", "process": "replay", "format": "2", "episode": "2"}
     assert (metadata.name, metadata.metadata) == ("overfly/replay", facts_ | {"ticks": str(T)})
     assert (attachment.name, attachment.media_type) == (FILE, "application/json")
     assert attachment.data == path.with_suffix(".layout.json").read_bytes()

@@ -198,7 +198,7 @@ def test_a_toml_document_builds() -> None:
         ("gama", "did you mean dqn.gamma?"),
         ("DQN.Gamma", "did you mean dqn.gamma?"),
         ("learning_rte", "did you mean dqn.learning_rate?"),
-        ("training.push_every", "did you mean training.publish_every?"),
+        ("training.publish_evry", "did you mean training.publish_every?"),
         ("stat", "did you mean world.start or exploration.start?"),
         ("dqn.gamma.x", "did you mean dqn.gamma?"),
         ("trial.stall_for", "overfly doctor --settings"),

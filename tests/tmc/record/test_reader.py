@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import channels, schemas
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, info, read
 from tmc.record.run_folder import run_files
@@ -53,6 +53,27 @@ def facts(path, all_of_it=True):
     if not all_of_it:
         return ticks, {}, [], log.damage
     return ticks, log.metadata(), [a.data for a in log.attachments()], log.damage
+
+
+@pytest.mark.parametrize("use", [lambda p: list(read(p)), lambda p: Log(p).damage, lambda p: Log(p).metadata(), info])
+def test_a_log_of_another_format_is_refused_with_both_versions(tmp_path, monkeypatch, use):
+    path = tmp_path / "tmc.mcap"
+    monkeypatch.setattr(channels, "FORMAT", "1")
+    make(path)
+    with pytest.raises(
+        RecordError, match=r"tmc\.mcap was written in log format 1, this version reads 2: use the version"
+    ):
+        use(path)
+
+
+def test_metadata_of_other_makers_may_have_a_format_of_its_own(tmp_path):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("camera", {"format": "jpeg"})
+        writer.finish()
+    assert Log(path).metadata() == {"format": "jpeg"}
 
 
 def test_cut_anywhere(tmp_path, finished):

@@ -58,7 +58,7 @@ def test_every_topic_comes_back(tmp_path):
     assert {e.topic: e.message for e in read(path)} == messages()
     log = Log(path)
     assert log.finished and log.damage is None
-    assert log.metadata() == {"format": "1", "process": "tmc", "clock": "wall", "team.size": "3"}
+    assert log.metadata() == {"format": "2", "process": "tmc", "clock": "wall", "team.size": "3"}
     assert [(a.name, a.media_type, a.data) for a in log.attachments()] == [
         ("config.toml", "application/toml", b"a = 1")
     ]

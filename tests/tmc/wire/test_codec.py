@@ -145,7 +145,7 @@ def test_every_cut_header_is_malformed() -> None:
     assert {refused([whole[:n]]).code for n in range(len(whole))} == {"malformed"}
 
 
-@pytest.mark.parametrize("version", [0, 2, PROTOCOL + 1, -1, 2**63, True, 1.0, "1", None, [1], b"1", ...])
+@pytest.mark.parametrize("version", [0, 1, PROTOCOL + 1, -1, 2**63, True, 1.0, "1", None, [1], b"1", ...])
 def test_a_foreign_version_is_refused_before_anything_else(version: Any) -> None:
     values = {} if version is ... else {"v": version}
     error = refused([msgpack.packb({"type": "Nonsense", "junk": 1, **values})])
@@ -189,7 +189,7 @@ def test_long_lists_and_maps_are_refused(kind: str, entries: int) -> None:
 @pytest.mark.parametrize("opener", [b"\x91", b"\x81\xa1a"], ids=["lists", "maps"])
 def test_nested_values_are_refused(place: str, depth: int, opener: bytes) -> None:
     """Wherever they stand and however deep they are."""
-    entries = {"v": b"\x01", "type": b"\xadPolicyRequest", "version": b"\x01"}
+    entries = {"v": bytes([PROTOCOL]), "type": b"\xadPolicyRequest", "version": b"\x01"}
     entries[place] = opener * depth + b"\xc0"
     packed = b"".join(msgpack.packb(key) + value for key, value in entries.items())
     assert refused([bytes([0x80 + len(entries)]) + packed]).code in {"malformed", "version", "unknown"}
@@ -200,7 +200,7 @@ def test_a_bomb_of_empty_maps_does_not_fill_the_memory() -> None:
     bomb = b"\x80"
     for _ in range(3):
         bomb = b"\xdc\x00\x40" + bomb * 64
-    frame = b"\x83\xa1v\x01\xa4type\xadPolicyRequest\xa7version" + bomb
+    frame = b"\x83\xa1v" + bytes([PROTOCOL]) + b"\xa4type\xadPolicyRequest\xa7version" + bomb
     tracemalloc.start()
     assert refused([frame]).code == "malformed"
     peak = tracemalloc.get_traced_memory()[1]
@@ -213,12 +213,12 @@ def test_a_bomb_of_empty_maps_does_not_fill_the_memory() -> None:
 def test_ext_types_are_refused(code: int, size: int) -> None:
     """Timestamps (-1) too."""
     ext = b"\xc7" + bytes([size, code % 256]) + bytes(size)
-    frame = b"\x83\xa1v\x01\xa4type\xadPolicyRequest\xa7version" + ext
+    frame = b"\x83\xa1v" + bytes([PROTOCOL]) + b"\xa4type\xadPolicyRequest\xa7version" + ext
     assert refused([frame]).code == "malformed"
 
 
 def test_text_that_is_no_utf_8_is_refused() -> None:
-    assert refused([b"\x83\xa1v\x01\xa4type\xa3End\xa6reason\xa1\xff"]).code == "malformed"
+    assert refused([b"\x83\xa1v" + bytes([PROTOCOL]) + b"\xa4type\xa3End\xa6reason\xa1\xff"]).code == "malformed"
 
 
 # Fields

@@ -25,12 +25,11 @@ from tmc.kernel.grid import ACTIONS
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
 from tmc.record import builders, schemas
-from tmc.record.channels import uav_topic
+from tmc.record.channels import FORMAT, uav_topic
 from tmc.record.disk import write_atomically
 from tmc.record.errors import RecordError
 from tmc.record.mcap.export import Export
 from tmc.record.run_folder import RunFolder
-from tmc.record.writer import FORMAT
 
 TICK_NS = 100_000_000
 """Log time per tick, ns."""
