@@ -14,8 +14,8 @@ from typing import Any
 from actors.planners import Controller, LocalState, QController
 from tmc.kernel.observation import ObservationBuilder
 from tmc.record.builders import record_digest
+from tmc.record.overfly_pb2 import ObservationHashes
 from tmc.record.run_folder import RunFolder
-from tmc.record.schemas import ObservationHashes
 from tmc.wire.messages import Record
 
 EXPLORED = 0

@@ -25,8 +25,8 @@ from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
 from tmc.record.builders import location_fix
 from tmc.record.channels import ACTIVE, uav_topic
+from tmc.record.overfly_pb2 import UavStatus
 from tmc.record.reader import Log
-from tmc.record.schemas import UavStatus
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 from tmc.wire import process, sockets

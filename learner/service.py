@@ -20,8 +20,8 @@ from tmc.kernel.config import build
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
 from tmc.record.disk import write_atomically
+from tmc.record.overfly_pb2 import LearnerMetrics
 from tmc.record.run_folder import RunFolder
-from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
 from tmc.wire import capacity, process, sockets
 from tmc.wire import messages as m

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
-from tmc.record.schemas import FlightRecord, foxglove, message_class
+from tmc.record.overfly_pb2 import FlightRecord
+from tmc.record.schemas import foxglove, message_class
 from tmc.wire.fields import FieldError
 from tmc.wire.messages import Record
 
