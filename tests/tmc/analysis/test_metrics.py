@@ -314,7 +314,7 @@ def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, t
     journal = Journal(tmp_path, world := World(config), "run")
     mission = LockStep(world, None, journal.take)
     for i in (0, 1):
-        for to, message in mission._exchange(i, Hello("uav", i, 1)):
+        for to, message in mission._exchange(i, Hello(role="uav", uav=i, incarnation=1)):
             mission.fleet.deliver(to, message)
     mission.fleet.pilots[1].advance = lambda: None
     station, now = mission.station, 100.0
