@@ -20,6 +20,7 @@ from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
+from tmc.record.overfly_pb2 import ObservationHashes
 from tmc.record.run_folder import RunFolder
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 RUN = "lockstep"
 """The run's name in the log of a mission in one process."""
-KeepHashes = Callable[[int, Any], None]
+KeepHashes = Callable[[int, ObservationHashes], None]
 """Takes (uav, overfly.ObservationHashes of the moves of a record)."""
 
 

@@ -9,7 +9,6 @@ import importlib
 from contextlib import suppress
 from functools import cache
 from types import ModuleType
-from typing import Any
 
 from google.protobuf import descriptor_pb2
 from google.protobuf.descriptor import FileDescriptor
@@ -22,7 +21,7 @@ PACKAGE = overfly_pb2.DESCRIPTOR.package
 
 
 @cache
-def message_class(schema: str) -> Any:
+def message_class(schema: str) -> type[Message]:
     """Return the class of a schema such as `overfly.Sync` or `foxglove.Grid`; RecordError when it is not known."""
     package, _, name = schema.partition(".")
     found: type[Message] | None = None
@@ -44,7 +43,7 @@ def foxglove(name: str) -> ModuleType:
 def schema_bytes(schema: str) -> bytes:
     """Return what MCAP stores of a protobuf schema: a FileDescriptorSet with all types that it depends on."""
     files = descriptor_pb2.FileDescriptorSet()
-    file: FileDescriptor = message_class(schema).DESCRIPTOR.file
+    file: FileDescriptor = message_class(schema).DESCRIPTOR.file  # type: ignore[assignment]  # or its twin in C
     _collect(file, files, set())
     return files.SerializeToString()
 
