@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN ?= runs/demo-$(shell date -u +%Y%m%d-%H%M%S)
 
-.PHONY: demo test explore check lint docs clean
+.PHONY: demo test explore check lint proto docs clean
 
 # The main job: three UAV processes, the TMC and the learner on downtown Toronto; then the policy against the baselines.
 demo: $(VENV)/.run
@@ -31,12 +31,16 @@ docs: $(VENV)/.docs
 
 check: lint docs test
 
+# The protobuf classes, after a change of a .proto file. An install generates them as well.
+proto: $(VENV)/.dev
+	$(BIN)/python hatch_build.py
+
 $(VENV)/bin/pip:
 	$(PYTHON) -m venv $(VENV)
 
 # The constraints pin what we develop with; pyproject.toml keeps the ranges that users need. torch goes first, so that no
 # later resolution can choose another build of it.
-$(VENV)/.run: pyproject.toml constraints.txt | $(VENV)/bin/pip
+$(VENV)/.run: pyproject.toml constraints.txt hatch_build.py tmc/record/overfly.proto | $(VENV)/bin/pip
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt torch
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[all]"
 	@touch $@

@@ -9,13 +9,12 @@ from __future__ import annotations
 import os
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
 
 from actors.planners import Controller, LocalState, QController
 from tmc.kernel.observation import ObservationBuilder
 from tmc.record.builders import record_digest
+from tmc.record.overfly_pb2 import ObservationHashes
 from tmc.record.run_folder import RunFolder
-from tmc.record.schemas import ObservationHashes
 from tmc.wire.messages import Record
 
 EXPLORED = 0
@@ -43,7 +42,7 @@ class ObservationHasher:
         """Hash a state that the UAV is about to decide by."""
         self._hashes[state.tick] = digest(self._observer, state)
 
-    def hashes_for(self, record: Record) -> Any:
+    def hashes_for(self, record: Record) -> ObservationHashes:
         """Return the overfly.ObservationHashes for the moves of a record, and forget all hashes."""
         moves = range(max(record.first, 1), record.tick + 1)
         hashes = [self._hashes.get(tick - 1, EXPLORED) for tick in moves]

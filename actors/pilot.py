@@ -160,7 +160,7 @@ class Pilot:
         if self._planner is not None or version == self.policy:
             return None
         self.phase, self._then, self.wanted = Phase.POLICY, then, version
-        return PolicyRequest(version)
+        return PolicyRequest(version=version)
 
     def on_lost(self, lost: Lost) -> None:
         """Fly on without a UAV that is lost for the rest of the episode."""
@@ -228,13 +228,23 @@ class Pilot:
         flown = self.builder
         seen = np.array(flown.seen, "<u2").reshape(-1, 2) if flown.seen else None
         self.pending = Record(
-            self.uav, self.incarnation, self.sequence, self.episode, flown.first, self.t, self.version, self.policy,
-            np.array(flown.cells, "<u2"), np.array(flown.actions, "u1"), np.array(flown.blocks, "u1"),
-            np.array(flown.rewards, "<f4"),
-            EMPTY if seen is None else seen[:, 0].copy(), EMPTY if seen is None else seen[:, 1].copy(),
-            np.array(flown.values, "<f4") if flown.values else NONE,
-            self._clock(),
-        )  # fmt: skip
+            uav=self.uav,
+            incarnation=self.incarnation,
+            sequence=self.sequence,
+            episode=self.episode,
+            first=flown.first,
+            tick=self.t,
+            version=self.version,
+            policy=self.policy,
+            cells=np.array(flown.cells, "<u2"),
+            actions=np.array(flown.actions, "u1"),
+            blocks=np.array(flown.blocks, "u1"),
+            rewards=np.array(flown.rewards, "<f4"),
+            seen_tick=EMPTY if seen is None else seen[:, 0].copy(),
+            seen_cell=EMPTY if seen is None else seen[:, 1].copy(),
+            values=np.array(flown.values, "<f4") if flown.values else NONE,
+            sent=self._clock(),
+        )
         self.unacknowledged.append(self.pending)
         self.sequence += 1
         self.shipped = self.t

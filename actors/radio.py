@@ -68,7 +68,9 @@ class RadioTracks:
         """Send this UAV's track from tick `start` on. `ask`: request the peer's track from this tick on; -1: none."""
         own = self._tracks[self.uav]
         cells = np.array(own[start:], "<u2")
-        self._send(Beacon(self.uav, self._episode, start, cells, np.array(to, "<u2"), ask))
+        self._send(
+            Beacon(uav=self.uav, episode=self._episode, tick=start, cells=cells, to=np.array(to, "<u2"), ask=ask)
+        )
         for j in to:
             self._sent_up_to[j] = len(own) - 1
 

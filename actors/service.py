@@ -25,8 +25,8 @@ from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
 from tmc.record.builders import location_fix
 from tmc.record.channels import ACTIVE, uav_topic
+from tmc.record.overfly_pb2 import UavStatus
 from tmc.record.reader import Log
-from tmc.record.schemas import UavStatus
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
 from tmc.wire import process, sockets
@@ -100,7 +100,7 @@ class Service:
 
     def _join(self, stop: Callable[[], bool]) -> tuple[Pilot, RadioTracks | None]:
         """Send Hello until the TMC answers, and build the pilot of the mission that it names. Raises FlightEnded."""
-        hello = m.Hello("uav", self.uav, self.incarnation)
+        hello = m.Hello(role="uav", uav=self.uav, incarnation=self.incarnation)
         while not stop():
             if self.reminder.due():
                 process.note(f"UAV {self.uav} waits for a TMC at {sockets.waiting(self.endpoint)}")
@@ -174,7 +174,7 @@ class Service:
 
     def leave(self, reason: str) -> None:
         """Tell the TMC why this process ends."""
-        self.send(m.Bye("uav", self.uav, plain(reason)))
+        self.send(m.Bye(role="uav", uav=self.uav, reason=plain(reason)))
 
     def _send_beacon(self, beacon: m.Beacon) -> None:
         sockets.send(self.sock, beacon)
@@ -207,11 +207,19 @@ class Service:
         if pilot.phase is Phase.MAP and pilot.pending is not None:
             self.send(pilot.pending)
         elif pilot.phase is Phase.POLICY:
-            self.send(m.PolicyRequest(pilot.wanted))
+            self.send(m.PolicyRequest(version=pilot.wanted))
         elif pilot.under_way:
-            self.send(m.Alive(self.uav, self.incarnation, pilot.t, self._awaited_peer, pilot.sequence))
+            self.send(
+                m.Alive(
+                    uav=self.uav,
+                    incarnation=self.incarnation,
+                    tick=pilot.t,
+                    peer=self._awaited_peer,
+                    sequence=pilot.sequence,
+                )
+            )
         else:
-            self.send(m.Hello("uav", self.uav, self.incarnation))
+            self.send(m.Hello(role="uav", uav=self.uav, incarnation=self.incarnation))
 
     def _handle(self, message: m.Message | None) -> m.Message | None:
         """Handle a message of the TMC or a peer; return the answer to the TMC. Raises FlightEnded."""
@@ -259,7 +267,7 @@ class Service:
             raise FlightEnded(process.FENCED, error.text)
         if error.code == "state" and time.monotonic() - self._hello_at > RETRY_BACKOFF_S[0]:
             self._hello_at = time.monotonic()  # a restarted TMC does not know this process
-            self.send(m.Hello("uav", self.uav, self.incarnation))
+            self.send(m.Hello(role="uav", uav=self.uav, incarnation=self.incarnation))
         if error.code in {"refused", "version"}:
             raise FlightEnded(process.USAGE, f"the TMC refused: {error.text}")
 

@@ -20,8 +20,8 @@ from tmc.kernel.config import build
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import world_of_run
 from tmc.record.disk import write_atomically
+from tmc.record.overfly_pb2 import LearnerMetrics
 from tmc.record.run_folder import RunFolder
-from tmc.record.schemas import LearnerMetrics
 from tmc.record.writer import LogWriter
 from tmc.wire import capacity, process, sockets
 from tmc.wire import messages as m
@@ -92,7 +92,12 @@ class Service:
                 process.note(
                     f"the learner waits for a TMC at {sockets.waiting(sockets.learner_endpoint(self.endpoint))}"
                 )
-            sockets.send(self.sock, m.Hello("learner", -1, self.incarnation, saved.meta.updates if saved else 0))
+            sockets.send(
+                self.sock,
+                m.Hello(
+                    role="learner", uav=-1, incarnation=self.incarnation, updates=saved.meta.updates if saved else 0
+                ),
+            )
             if self.sock.poll(1000):
                 message = self._receive()
                 if isinstance(message, m.Welcome | m.End):
@@ -133,7 +138,9 @@ class Service:
         """Return the next message, if one arrives within HELLO_INTERVAL_S; the wait counts as idle time."""
         since = time.monotonic()
         if not self.sock.poll(int(HELLO_INTERVAL_S * 1000)):
-            sockets.send(self.sock, m.Hello("learner", -1, self.incarnation, self.trainer.updates))
+            sockets.send(
+                self.sock, m.Hello(role="learner", uav=-1, incarnation=self.incarnation, updates=self.trainer.updates)
+            )
             self._hello_sent = True
         self._idle += time.monotonic() - since
         message = self._receive()
@@ -193,7 +200,11 @@ class Service:
         while len(self._in_flight) < MAX_REQUESTS:
             self._request += 1
             self._in_flight.add(self._request)
-            sockets.send(self.sock, m.SampleRequest(self._request, *self.trainer.take_td_errors(), self.incarnation))
+            index, errors = self.trainer.take_td_errors()
+            sockets.send(
+                self.sock,
+                m.SampleRequest(request=self._request, index=index, errors=errors, incarnation=self.incarnation),
+            )
 
     def _update(self, minibatch: m.Minibatch) -> None:
         """Make one update; publish a policy, write a checkpoint and log metrics when due. Raises TrainingError."""
@@ -208,7 +219,14 @@ class Service:
     def _publish(self) -> bytes:
         """Publish the current policy to the TMC; return its file."""
         version, model = self.trainer.policy()
-        push = m.PolicyPush(version, self.trainer.updates, self._loss, model, time.time_ns(), self.incarnation)
+        push = m.PolicyPush(
+            version=version,
+            updates=self.trainer.updates,
+            loss=self._loss,
+            model=model,
+            sent=time.time_ns(),
+            incarnation=self.incarnation,
+        )
         sockets.send(self.sock, push)
         return model
 
@@ -238,7 +256,7 @@ class Service:
         self._log_metrics(time.monotonic())
         checkpoint.save(RunFolder(self.out).checkpoints, self.trainer)
         write_policy(RunFolder(self.out).final_policy, self._publish())
-        sockets.send(self.sock, m.Bye("learner", -1, f"{self.trainer.updates} updates"))
+        sockets.send(self.sock, m.Bye(role="learner", uav=-1, reason=f"{self.trainer.updates} updates"))
 
     def close(self) -> None:
         """Close the socket and the log."""

@@ -78,7 +78,7 @@ class Team:
         pilots = [Pilot(world, i, 1, tracks[i], observer, lambda _: self.controller) for i in team]
         self.fleet, self._elsewhere = Fleet(pilots, self._exchange), 0.0
         for i in team:
-            for j, answer in self._exchange(i, m.Hello("uav", i, 1)):
+            for j, answer in self._exchange(i, m.Hello(role="uav", uav=i, incarnation=1)):
                 self.fleet.deliver(j, answer)
 
     def _exchange(self, uav: int, message: m.Message) -> list[tuple[int, m.Message]]:

@@ -218,5 +218,17 @@ def _batches(replay: Replay, count: int) -> Iterator[Batch]:
         s = replay.sample(number, replay.world.config.dqn.batch_size)
         v = s.views
         yield builder.build(
-            Minibatch(number, 0, 0, v.cells, v.peers, v.u, s.action, s.reward, s.discount, s.allowed, s.index)
+            Minibatch(
+                request=number,
+                episodes=0,
+                ticks=0,
+                cells=v.cells,
+                peers=v.peers,
+                u=v.u,
+                action=s.action,
+                reward=s.reward,
+                discount=s.discount,
+                allowed=s.allowed,
+                index=s.index,
+            )
         )

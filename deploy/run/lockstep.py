@@ -20,6 +20,7 @@ from tmc.kernel.config import ConfigError
 from tmc.kernel.observation import ObservationBuilder
 from tmc.kernel.world import World
 from tmc.record.channels import uav_topic
+from tmc.record.overfly_pb2 import ObservationHashes
 from tmc.record.run_folder import RunFolder
 from tmc.record.writer import LogWriter
 from tmc.wire import messages as m
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 RUN = "lockstep"
 """The run's name in the log of a mission in one process."""
-KeepHashes = Callable[[int, Any], None]
+KeepHashes = Callable[[int, ObservationHashes], None]
 """Takes (uav, overfly.ObservationHashes of the moves of a record)."""
 
 
@@ -98,11 +99,11 @@ class LockStep:
     def run(self, show: Callable[[m.Status], None] | None = None) -> None:
         """Fly all episodes. `show` gets the status after every step. Raises FlightError, TrainingError."""
         if self.trainer is not None:
-            self._send_as_learner(m.Hello("learner", -1, 1))
+            self._send_as_learner(m.Hello(role="learner", uav=-1, incarnation=1))
             self._publish()
-            self._send_as_learner(m.SampleRequest(0))
+            self._send_as_learner(m.SampleRequest(request=0))
         for pilot in self.fleet.pilots:
-            for uav, reply in self._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
+            for uav, reply in self._exchange(pilot.uav, m.Hello(role="uav", uav=pilot.uav, incarnation=1)):
                 self.fleet.deliver(uav, reply)
         while self.fleet.step() | self._learn():
             if show is not None:
@@ -118,13 +119,14 @@ class LockStep:
             learned, self._loss = True, metrics.loss
             if metrics.updates % self.world.config.training.publish_every == 0:
                 self._publish(metrics.loss)
-            self._send_as_learner(m.SampleRequest(metrics.updates, *trainer.take_td_errors()))
+            index, errors = trainer.take_td_errors()
+            self._send_as_learner(m.SampleRequest(request=metrics.updates, index=index, errors=errors))
         return learned
 
     def _publish(self, loss: float = 0.0) -> bytes:
         assert self.trainer is not None
         version, model = self.trainer.policy()
-        self._send_as_learner(m.PolicyPush(version, self.trainer.updates, loss, model))
+        self._send_as_learner(m.PolicyPush(version=version, updates=self.trainer.updates, loss=loss, model=model))
         return model
 
 

@@ -46,7 +46,7 @@ class RunData:
         ]  # fmt: skip
         self.fleet = Fleet(pilots, self._exchange)
         for i in range(N):
-            for j, answer in self._exchange(i, m.Hello("uav", i, 1)):
+            for j, answer in self._exchange(i, m.Hello(role="uav", uav=i, incarnation=1)):
                 self.fleet.deliver(j, answer)
         while self.fleet.step():
             pass

@@ -270,16 +270,16 @@ def test_a_beacon_that_cannot_be_changes_nothing() -> None:
     radio.start_episode(2, [0, 8])
     none = np.zeros(0, "<u2")
     for uav, episode, cell in ((0, 2, 5), (2, 2, 5), (60_000, 2, 5), (1, 1, 5), (1, 2, 9), (1, 2, 65_535)):
-        radio.on_beacon(Beacon(uav, episode, 1, np.array([cell], "<u2"), none))
+        radio.on_beacon(Beacon(uav=uav, episode=episode, tick=1, cells=np.array([cell], "<u2"), to=none))
         assert radio.newest(1) == (0, 8) and radio.newest(0) == (0, 0) and radio.at(1, 1) == -1
     assert said == []
-    radio.on_beacon(Beacon(1, 2, 1, np.array([7, 6], "<u2"), none))
+    radio.on_beacon(Beacon(uav=1, episode=2, tick=1, cells=np.array([7, 6], "<u2"), to=none))
     assert radio.newest(1) == (2, 6) and [radio.at(1, t) for t in range(4)] == [8, 7, 6, -1]
 
 
 def test_a_beacon_of_the_next_episode_is_kept_until_it_begins() -> None:
     radio = RadioTracks(0, 2, Grid(3, 3), 1.5, lambda _: None)
-    early = Beacon(1, 1, 1, np.array([5], "<u2"), np.zeros(0, "<u2"))
+    early = Beacon(uav=1, episode=1, tick=1, cells=np.array([5], "<u2"), to=np.zeros(0, "<u2"))
     radio.on_beacon(early)
     radio.start_episode(1, [0, 8])
     assert radio.newest(1) == (1, 5)

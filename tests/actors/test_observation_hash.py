@@ -39,7 +39,22 @@ class North:
 def record(first: int, tick: int) -> Record:
     moves = tick - max(first, 1) + 1
     cells, small = np.zeros(tick - first + 1, "<u2"), np.zeros(moves, "u1")
-    return Record(2, 1, 0, 1, first, tick, 0, 0, cells, small, small, np.zeros(moves, "<f4"), EMPTY, EMPTY)
+    return Record(
+        uav=2,
+        incarnation=1,
+        sequence=0,
+        episode=1,
+        first=first,
+        tick=tick,
+        version=0,
+        policy=0,
+        cells=cells,
+        actions=small,
+        blocks=small,
+        rewards=np.zeros(moves, "<f4"),
+        seen_tick=EMPTY,
+        seen_cell=EMPTY,
+    )
 
 
 def test_the_hash_is_what_the_document_says(observer: ObservationBuilder, state: LocalState) -> None:

@@ -264,19 +264,19 @@ def learning(world_of: Callable[..., World], **values: Any) -> tuple[Pilot, Poli
 def test_a_policy_is_fetched_at_an_exchange_and_nowhere_else(world_of: Callable[..., World]) -> None:
     pilot, policies, world = learning(world_of)
     start = world.starts(1)[0]
-    assert pilot.on_begin(begin(world, 1, start, policy=3)) == PolicyRequest(3)
+    assert pilot.on_begin(begin(world, 1, start, policy=3)) == PolicyRequest(version=3)
     assert pilot.advance() is None and pilot.phase is Phase.POLICY
-    pilot.on_policy(Policy(2, b"two"))
+    pilot.on_policy(Policy(version=2, model=b"two"))
     assert pilot.phase is Phase.POLICY and policies.made == []
-    pilot.on_policy(Policy(3, b"three"))
+    pilot.on_policy(Policy(version=3, model=b"three"))
     record = pilot.advance()
     assert record is not None and (record.policy, policies.made) == (3, [b"three"])
     assert pilot.on_map(answer(world, 1, 0, policy=3)) is None
-    pilot.on_policy(Policy(4, b"four"))  # not requested
+    pilot.on_policy(Policy(version=4, model=b"four"))  # not requested
     record = pilot.advance()
     assert record is not None and (record.tick, record.policy, policies.made) == (10, 3, [b"three"])
-    assert pilot.on_map(answer(world, 1, 10, policy=5)) == PolicyRequest(5)
-    pilot.on_policy(Policy(6, b"six"))  # 5 was superseded
+    assert pilot.on_map(answer(world, 1, 10, policy=5)) == PolicyRequest(version=5)
+    pilot.on_policy(Policy(version=6, model=b"six"))  # 5 was superseded
     assert (pilot.phase, pilot.policy, policies.made) == (Phase.ACT, 6, [b"three", b"six"])
 
 
@@ -286,7 +286,7 @@ def test_exploration_is_addressed(world_of: Callable[..., World], mask: bool) ->
     values = {"exploration.start": 0.3, "exploration.end": 0.3, "exploration.mask_blocked": mask, "training.seed": 42}
     pilot, _, world = learning(world_of, **values, **{"comms.period": 1000})
     pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=1))
-    pilot.on_policy(Policy(1, b""))
+    pilot.on_policy(Policy(version=1, model=b""))
     pilot.advance()
     pilot.on_map(answer(world, 7, 0, policy=1))
     while (record := pilot.advance()) is None:
@@ -320,7 +320,7 @@ def test_records_carry_q_of_each_move_where_priorities_are_on(world_of: Callable
     policy = Worthy([STAY] * 1000)
     pilot._make_controller = lambda _: policy
     pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=1))
-    pilot.on_policy(Policy(1, b""))
+    pilot.on_policy(Policy(version=1, model=b""))
     record = pilot.advance()
     assert record is not None and record.values.size == 0  # no move yet
     pilot.on_map(answer(world, 7, 0, policy=1))
@@ -353,7 +353,7 @@ def test_a_policy_that_fails_in_flight_names_uav_tick_and_policy(
 
     pilot._make_controller = lambda _: Failing([STAY] * 1000)
     pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=5))
-    pilot.on_policy(Policy(5, b""))
+    pilot.on_policy(Policy(version=5, model=b""))
     pilot.advance()
     pilot.on_map(answer(world, 7, 0, policy=5))
     where = "UAV 0 stops at tick 3 of episode 7: policy 5 gave values that are not finite"
@@ -370,7 +370,7 @@ def test_a_policy_that_cannot_fly_is_named_where_it_is_refused(world_of: Callabl
     pilot._make_controller = refuse
     pilot.on_begin(begin(world, 7, world.starts(7)[0], policy=5))
     with pytest.raises(PolicyError, match="UAV 0 cannot fly policy 5: the file is empty"):
-        pilot.on_policy(Policy(5, b""))
+        pilot.on_policy(Policy(version=5, model=b""))
 
 
 def test_a_planner_never_explores(team: Callable[..., Team]) -> None:

@@ -33,7 +33,7 @@ def test_a_mission_that_is_over_ends_a_new_process(tmp_path: Path, short: Path) 
             assert tmc.poll(1000 * PATIENCE_S)
             frames = sockets.receive(tmc)
             assert frames is not None
-            sockets.send(tmc, m.End("the mission is over"), bytes(frames[0]))
+            sockets.send(tmc, m.End(reason="the mission is over"), bytes(frames[0]))
             with pytest.raises(FlightEnded, match="over") as left:
                 joining.result(PATIENCE_S)
             assert left.value.code == process.DONE
@@ -50,9 +50,21 @@ def test_beacons_of_others_do_not_keep_a_uav_from_requesting_and_resending(tmp_p
     endpoint, context = f"ipc://{short}/sync", zmq.Context[Any]()
     tmc, service, over = sockets.router(context, endpoint), Service(0, endpoint, tmp_path / "R"), threading.Event()
     zeros = np.zeros(world.law.cells.size, "<u2")
-    welcome = m.Welcome(json.dumps(flat(world.config)), world.map.fingerprint, "run", "", 0, 0)
-    begin = m.Begin(episode, 0, -1, 0, 0, 0, zeros, np.array(starts[:1], "<u2"), m.EMPTY)
-    beacon = m.Beacon(2, episode, 1, np.array(starts[2:], "<u2"), np.array([0], "<u2"))
+    welcome = m.Welcome(
+        config=json.dumps(flat(world.config)), map=world.map.fingerprint, run="run", tracks="", policy=0, sequence=0
+    )
+    begin = m.Begin(
+        episode=episode,
+        tick=0,
+        shipped=-1,
+        sequence=0,
+        version=0,
+        policy=0,
+        last_visit=zeros,
+        track=np.array(starts[:1], "<u2"),
+        lost=m.EMPTY,
+    )
+    beacon = m.Beacon(uav=2, episode=episode, tick=1, cells=np.array(starts[2:], "<u2"), to=np.array([0], "<u2"))
     said: Counter[str] = Counter()
     try:
         with ThreadPoolExecutor(1) as other:
@@ -70,7 +82,20 @@ def test_beacons_of_others_do_not_keep_a_uav_from_requesting_and_resending(tmp_p
                     for answer in (welcome, begin):
                         sockets.send(tmc, answer, bytes(identity))
                 elif isinstance(message, m.Record):
-                    sockets.send(tmc, m.Map(episode, 0, 1, 0, 0, 0, zeros, m.EMPTY), bytes(identity))
+                    sockets.send(
+                        tmc,
+                        m.Map(
+                            episode=episode,
+                            tick=0,
+                            version=1,
+                            policy=0,
+                            sequence=0,
+                            acknowledged=0,
+                            last_visit=zeros,
+                            active=m.EMPTY,
+                        ),
+                        bytes(identity),
+                    )
             over.set()
             with pytest.raises(FlightEnded):
                 flying.result(PATIENCE_S)

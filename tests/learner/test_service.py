@@ -26,7 +26,7 @@ NOWHERE = "tcp://127.0.0.1:1"
 def test_a_map_that_is_not_the_tmcs_is_refused(tmp_path: Path) -> None:
     """A map of the same name and size: the learner would draw its observations over another town."""
     service = Service(NOWHERE, tmp_path / "R")
-    welcome = m.Welcome(json.dumps(flat(build({}))), "another", "run", "", 0, 0)
+    welcome = m.Welcome(config=json.dumps(flat(build({}))), map="another", run="run", tracks="", policy=0, sequence=0)
     try:
         with pytest.raises(EndpointError, match="not the one that the TMC flies: copy it"):
             service._prepare(welcome, None)
@@ -40,7 +40,10 @@ def test_a_welcome_to_another_mission_ends_the_learner(tmp_path: Path) -> None:
     service = Service(NOWHERE, tmp_path / "R")
     config = build({"network.channels": (2, 2), "network.dense": 2})
     world = World(config)
-    first, other = (m.Welcome(json.dumps(flat(config)), world.map.fingerprint, run, "", 0, 0) for run in ("a", "b"))
+    first, other = (
+        m.Welcome(config=json.dumps(flat(config)), map=world.map.fingerprint, run=run, tracks="", policy=0, sequence=0)
+        for run in ("a", "b")
+    )
     try:
         service._prepare(first, None)
         with pytest.raises(EndpointError, match="another mission runs here now"):
@@ -78,7 +81,9 @@ def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tm
     tmc = sockets.router(context := zmq.Context(), f"ipc://{short}/sync.learner")
     service = Service(f"ipc://{short}/sync", tmp_path / "R")
     config = build({"network.channels": (2, 2), "network.dense": 2})
-    welcome = m.Welcome(json.dumps(flat(config)), World(config).map.fingerprint, "run", "", 0, 0)
+    welcome = m.Welcome(
+        config=json.dumps(flat(config)), map=World(config).map.fingerprint, run="run", tracks="", policy=0, sequence=0
+    )
 
     try:
         service._prepare(welcome, None)
@@ -99,8 +104,12 @@ def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tm
 def test_a_learner_leaves_when_a_newer_one_has_its_place(tmp_path: Path) -> None:
     service = Service(NOWHERE, tmp_path / "R")
     try:
-        assert not service._handle(m.Error("fenced", "a newer process is the learner: leave", service.incarnation + 1))
+        assert not service._handle(
+            m.Error(code="fenced", text="a newer process is the learner: leave", incarnation=service.incarnation + 1)
+        )
         with pytest.raises(ReplacedError, match="a newer process is the learner"):
-            service._handle(m.Error("fenced", "a newer process is the learner: leave", service.incarnation))
+            service._handle(
+                m.Error(code="fenced", text="a newer process is the learner: leave", incarnation=service.incarnation)
+            )
     finally:
         service.close()

@@ -108,7 +108,7 @@ def fly() -> Callable[..., RunData]:
 
         fleet = Fleet(flown.pilots, exchange)
         for pilot in flown.pilots:
-            for i, reply in exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
+            for i, reply in exchange(pilot.uav, m.Hello(role="uav", uav=pilot.uav, incarnation=1)):
                 fleet.deliver(i, reply)
         while fleet.step():
             pass

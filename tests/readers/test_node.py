@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 from tests.command import PATIENCE_S
 from tests.readers.conftest import Topic
-from tmc.record import schemas
+from tmc.record import overfly_pb2, schemas
 
 HERE = Path(__file__).parent
 Read = Callable[..., subprocess.CompletedProcess[str]]
@@ -72,7 +72,7 @@ def write(path: Path, messages: Iterable[tuple[int, bytes]]) -> None:
         writer.finish()
 
 
-INTACT = schemas.Sync(tick=7).SerializeToString()
+INTACT = overfly_pb2.Sync(tick=7).SerializeToString()
 WRONG = {
     "ends within a field": ([(1, INTACT), (2, INTACT[:-1])], "index out of range"),
     "field that the schema has not": ([(1, b"\x78\x01")], "not what its schema describes"),

@@ -72,7 +72,7 @@ def test_hostile_frames_change_nothing(here, tmp_path: Path) -> None:
     endpoint = f"tcp://127.0.0.1:{sockets.free_port()}"
     options = ("--actors", 2, "--ticks", 300, "--seed", 3)
     tmc = start(tmp_path, "tmc", "--fly", "planner:greedy", *options, "--bind", endpoint, "--out", tmp_path / "R")
-    good = [encode(m.StatusRequest())[0], encode(m.SampleRequest(1))[0], encode(m.PolicyRequest(99))[0]]
+    good = [encode(m.StatusRequest())[0], encode(m.SampleRequest(request=1))[0], encode(m.PolicyRequest(version=99))[0]]
     bad = [b"", b"\xc1", b"x" * 100_000, b"\x81\xa1v\x02", good[0].replace(b"\x01", b"\x09"), b"\xdf\xff\xff\xff\xff"]
     with zmq.Context() as context:
         hostile = [sockets.dealer(context, endpoint, f"observer-{i}") for i in range(3)]

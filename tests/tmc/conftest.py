@@ -122,7 +122,7 @@ class Mission:
         self.pilots: list[SpyPilot] = []
         for i in range(self.N):
             self.pilots.append(self._pilot(i))
-            self.up[i].append(m.Hello("uav", i, self.incarnations[i]))
+            self.up[i].append(m.Hello(role="uav", uav=i, incarnation=self.incarnations[i]))
 
     def _pilot(self, i: int) -> SpyPilot:
         who = self.world.config.team.controller
@@ -205,7 +205,7 @@ class Mission:
             pilot.airspace.tracks.hear(message)
         if isinstance(message, m.Error):
             assert self.restarts and message.code == "state", message.text
-            answer = m.Hello("uav", i, self.incarnations[i])
+            answer = m.Hello(role="uav", uav=i, incarnation=self.incarnations[i])
         if pilot.phase is Phase.ACT and pilot.t == self.T:
             pilot.note()
         if answer is not None:
@@ -231,9 +231,9 @@ class Mission:
             if pilot.phase is Phase.MAP and pilot.pending is not None:
                 self.up[i].append(pilot.pending)
             elif pilot.phase is Phase.POLICY:
-                self.up[i].append(m.PolicyRequest(pilot.wanted))
+                self.up[i].append(m.PolicyRequest(version=pilot.wanted))
             else:
-                self.up[i].append(m.Hello("uav", i, self.incarnations[i]))
+                self.up[i].append(m.Hello(role="uav", uav=i, incarnation=self.incarnations[i]))
 
     def lose(self, i: int, *, on_the_air: bool) -> None:
         """UAV i's process dies, with what it was about to send unless that is on the air; a new one says hello."""
@@ -241,7 +241,7 @@ class Mission:
             self.up[i].clear()
         self.down[i].clear()
         self.pilots[i] = self._pilot(i)
-        self.up[i].append(m.Hello("uav", i, self.incarnations[i]))
+        self.up[i].append(m.Hello(role="uav", uav=i, incarnation=self.incarnations[i]))
 
     def restart(self, station: Station, entries: list[JournalEntry]) -> None:
         """The TMC is killed, and `station` goes on with these entries in its journal; what was on the air is lost."""

@@ -10,7 +10,8 @@ import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+
+from google.protobuf.message import Message
 
 from tmc.center.entries import JournalEntry
 from tmc.center.roster import Outbox
@@ -19,6 +20,7 @@ from tmc.kernel.world import World
 from tmc.record import builders
 from tmc.record.channels import CHANNELS
 from tmc.record.disk import write_atomically
+from tmc.record.overfly_pb2 import TeamMetrics
 from tmc.record.run_folder import RunFolder
 from tmc.record.schemas import message_class
 from tmc.record.writer import LogWriter
@@ -104,14 +106,14 @@ class Journal:
             policy_path(self.folder, version).unlink(missing_ok=True)
         self._policies, self._stale = set(held), set()
 
-    def _message(self, entry: JournalEntry) -> Any:
+    def _message(self, entry: JournalEntry) -> Message:
         if "record" in entry.values:
             return builders.flight_record(entry.values["record"])
         if entry.topic == "/tmc/last_visit":
             grid, cell = self.world.grid, self.world.map.cell_m
             return builders.grid(entry.values["last_visit"], grid.rows, grid.cols, cell, time.time_ns())
         message = message_class(_SCHEMA[entry.topic])(**entry.values)
-        if entry.topic == "/tmc/metrics":
+        if isinstance(message, TeamMetrics):
             message.elapsed = self._timer() - self._started
         return message
 

@@ -14,6 +14,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from google.protobuf.message import Message
+
 from tmc.center.entries import JournalEntry
 from tmc.center.episode import RefusedError
 from tmc.center.journal import policy_path
@@ -24,6 +26,7 @@ from tmc.kernel.config import Config
 from tmc.record.builders import to_record
 from tmc.record.errors import RecordError
 from tmc.record.mcap.parser import Message as LoggedMessage
+from tmc.record.overfly_pb2 import Episode, FlightRecord, Lost, Policy, Sync, TeamMetrics
 from tmc.record.reader import Log, decode
 
 Taker = Callable[[Station, Any, Path, float], None]
@@ -84,7 +87,7 @@ def play(
     return balance.missing()
 
 
-def _take(takers: dict[str, Taker], station: Station, message: Any, folder: Path, now: float) -> None:
+def _take(takers: dict[str, Taker], station: Station, message: Message, folder: Path, now: float) -> None:
     taker = takers.get(message.DESCRIPTOR.full_name)
     try:
         if taker is not None:
@@ -141,7 +144,7 @@ def skipped(log: Log, config: Config) -> range:
     return range(head + 1, ended - tail + 1)
 
 
-def _sum_episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
+def _sum_episode(station: Station, message: Episode, _folder: Path, _now: float) -> None:
     if message.phase == "begin":
         return
     _in_turn(station, message)
@@ -154,23 +157,23 @@ def _sum_episode(station: Station, message: Any, _folder: Path, _now: float) -> 
     station.blocked_by_uav += message.blocked_uav
 
 
-def _sum_record(station: Station, message: Any, _folder: Path, now: float) -> None:
+def _sum_record(station: Station, message: FlightRecord, _folder: Path, now: float) -> None:
     _next_of(station, message, now).sequence += 1
 
 
-def _sum_sync(station: Station, message: Any, _folder: Path, _now: float) -> None:
+def _sum_sync(station: Station, message: Sync, _folder: Path, _now: float) -> None:
     station.version = message.version
 
 
 # Episodes that are played in full.
 
 
-def _in_turn(station: Station, message: Any) -> None:
+def _in_turn(station: Station, message: Episode) -> None:
     if station.episode is not None or station.episodes != message.episode - 1:
         raise RecordError(f"the journal has episode {message.episode} out of turn: do not resume from it")
 
 
-def _next_of(station: Station, message: Any, now: float) -> Member:
+def _next_of(station: Station, message: FlightRecord, now: float) -> Member:
     """Return the member whose next record this is, after noting its process. Raises RecordError if it is not next."""
     team = station.roster
     if message.uav >= len(team) or message.sequence != team[message.uav].sequence:
@@ -181,7 +184,7 @@ def _next_of(station: Station, message: Any, now: float) -> Member:
     return member
 
 
-def _episode(station: Station, message: Any, _folder: Path, _now: float) -> None:
+def _episode(station: Station, message: Episode, _folder: Path, _now: float) -> None:
     begun = station.episode is not None and station.episode.number == message.episode
     if message.phase == "begin" and not begun:
         _in_turn(station, message)
@@ -190,7 +193,7 @@ def _episode(station: Station, message: Any, _folder: Path, _now: float) -> None
         station.finalise()
 
 
-def _record(station: Station, message: Any, _folder: Path, now: float) -> None:
+def _record(station: Station, message: FlightRecord, _folder: Path, now: float) -> None:
     record, episode = to_record(message), station.episode
     _next_of(station, message, now)
     if episode is None or record.episode != episode.number:
@@ -198,18 +201,18 @@ def _record(station: Station, message: Any, _folder: Path, now: float) -> None:
     station.accept(episode, record)
 
 
-def _lost(station: Station, message: Any, _folder: Path, _now: float) -> None:
+def _lost(station: Station, message: Lost, _folder: Path, _now: float) -> None:
     episode, uav = station.episode, message.uav
     if episode is not None and uav < episode.N and uav not in episode.lost:
         station.lose(episode, uav)
 
 
-def _policy(station: Station, message: Any, folder: Path, _now: float) -> None:
+def _policy(station: Station, message: Policy, folder: Path, _now: float) -> None:
     if message.version > station.policies.newest:
         station.take_policy(message.version, _model(message, folder), message.updates, message.loss)
 
 
-def _model(message: Any, folder: Path) -> bytes:
+def _model(message: Policy, folder: Path) -> bytes:
     """Return the policy file; empty if it is gone or damaged."""
     try:
         model = bytes(message.model) or files.read_bytes(policy_path(folder, message.version))
@@ -218,7 +221,7 @@ def _model(message: Any, folder: Path) -> bytes:
     return model if hashlib.sha256(model).hexdigest() == message.sha256 else b""
 
 
-def _metrics(station: Station, message: Any, _folder: Path, _now: float) -> None:
+def _metrics(station: Station, message: TeamMetrics, _folder: Path, _now: float) -> None:
     station.finalise()  # the TMC did so here; in between it may have accepted any number of records
     station.rate_limiter.updates = message.updates
 

@@ -106,7 +106,7 @@ class Station:
         """Count and note a frame that changes nothing, and send its sender an Error that says what was wrong."""
         self.rejected += 1
         self.out.notes.append(("WARNING", f"rejected a frame from {sender}: {text}"))
-        self.send(sender, m.Error(code, text[:1024], incarnation))
+        self.send(sender, m.Error(code=code, text=text[:1024], incarnation=incarnation))
 
     def _hello(self, sender: str, hello: m.Hello, now: float) -> None:
         config = json.dumps(flat(self.config))

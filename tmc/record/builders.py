@@ -5,16 +5,23 @@ from __future__ import annotations
 import hashlib
 from array import array
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmc.kernel.text import printable
 from tmc.record.errors import RecordError
-from tmc.record.schemas import FlightRecord, foxglove, message_class
+from tmc.record.overfly_pb2 import FlightRecord
+from tmc.record.schemas import foxglove
 from tmc.wire.fields import FieldError
 from tmc.wire.messages import Record
+
+if TYPE_CHECKING:  # importing each takes milliseconds: see schemas.foxglove
+    from foxglove_schemas_protobuf.GeoJSON_pb2 import GeoJSON
+    from foxglove_schemas_protobuf.Grid_pb2 import Grid
+    from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+    from foxglove_schemas_protobuf.Log_pb2 import Log
 
 FRAME = "map"
 """The frame of the grid: origin in its south-west corner, x east, y north, metres."""
@@ -34,7 +41,7 @@ _ARRAYS = {
 _CODES = {"<u2": "H", "u1": "B", "<f4": "f"}
 
 
-def flight_record(record: Record) -> Any:
+def flight_record(record: Record) -> FlightRecord:
     """Return the overfly.FlightRecord of a Record, without `sent`; `to_record` is the inverse."""
     numbers = {name: getattr(record, name) for name in _NUMBERS}
     return FlightRecord(**numbers, **{name: getattr(record, name).tolist() for name in _ARRAYS})
@@ -47,7 +54,7 @@ def record_digest(record: Record) -> str:
     return hashlib.blake2b(b"".join((numbers.encode(), *arrays)), digest_size=16).hexdigest()
 
 
-def to_record(proto: Any) -> Record:
+def to_record(proto: FlightRecord) -> Record:
     """Return the Record of an overfly.FlightRecord; RecordError when a value is not valid in a Record."""
     values: dict[str, Any] = {name: getattr(proto, name) for name in _NUMBERS}
     try:
@@ -66,7 +73,7 @@ def _array(values: Any, kind: str) -> NDArray[Any]:
         raise FieldError("range", f"a value does not fit {kind}") from None
 
 
-def grid(last_visit: NDArray[np.integer], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
+def grid(last_visit: NDArray[np.integer], rows: int, cols: int, cell_m: float, time_ns: int) -> Grid:
     """Return a foxglove.Grid of the ticks of the last visits, shape (K,), uint32; `last_visit` is the inverse.
 
     `cell_m`: size of a cell, metres. `time_ns`: its timestamp. RecordError as `layers`.
@@ -74,7 +81,7 @@ def grid(last_visit: NDArray[np.integer], rows: int, cols: int, cell_m: float, t
     return layers({"last_visit": last_visit.astype("<u4")}, rows, cols, cell_m, time_ns)
 
 
-def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: float, time_ns: int) -> Any:
+def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: float, time_ns: int) -> Grid:
     """Return a foxglove.Grid with these fields, each of shape (K,) and of a dtype of NUMERIC; `layer` is the inverse.
 
     `cell_m`: size of a cell, metres. The rows are reversed: those of a Grid go north, ours go south. RecordError when
@@ -86,7 +93,7 @@ def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: flo
     cells = np.empty(rows * cols, [(name, values.dtype) for name, values in fields.items()])
     for name, values in fields.items():
         cells[name] = values
-    message = message_class("foxglove.Grid")(
+    message: Grid = foxglove("Grid").Grid(
         frame_id=FRAME,
         column_count=cols,
         cell_stride=cells.itemsize,
@@ -104,7 +111,7 @@ def layers(fields: Mapping[str, NDArray[Any]], rows: int, cols: int, cell_m: flo
     return message
 
 
-def layer(message: Any, name: str) -> NDArray[Any]:
+def layer(message: Grid, name: str) -> NDArray[Any]:
     """Return the field `name` of a Grid, shape (K,), as given to `layers`; RecordError when there is none."""
     names = [field.name for field in message.fields]
     if name not in names:
@@ -116,27 +123,29 @@ def layer(message: Any, name: str) -> NDArray[Any]:
     return np.asarray(values.reshape(-1, message.column_count)[::-1].ravel())
 
 
-def last_visit(message: Any) -> NDArray[np.uint32]:
+def last_visit(message: Grid) -> NDArray[np.uint32]:
     """Return the ticks of the last visits, shape (K,), uint32, as given to `grid`."""
     return layer(message, "last_visit")
 
 
-def location_fix(lon: float, lat: float, time_ns: int, frame: str = FRAME, altitude: float = 0.0) -> Any:
+def location_fix(lon: float, lat: float, time_ns: int, frame: str = FRAME, altitude: float = 0.0) -> LocationFix:
     """Return a foxglove.LocationFix: degrees (WGS 84), altitude in metres."""
-    message = message_class("foxglove.LocationFix")(frame_id=frame, latitude=lat, longitude=lon, altitude=altitude)
+    fix = foxglove("LocationFix").LocationFix
+    message: LocationFix = fix(frame_id=frame, latitude=lat, longitude=lon, altitude=altitude)
     message.timestamp.FromNanoseconds(time_ns)
     return message
 
 
-def geojson(text: str) -> Any:
+def geojson(text: str) -> GeoJSON:
     """Return a foxglove.GeoJSON of a GeoJSON document."""
-    return message_class("foxglove.GeoJSON")(geojson=text)
+    message: GeoJSON = foxglove("GeoJSON").GeoJSON(geojson=text)
+    return message
 
 
-def log_message(level: str, text: str, name: str, time_ns: int) -> Any:
+def log_message(level: str, text: str, name: str, time_ns: int) -> Log:
     """Return a foxglove.Log; `name` is the process that writes it. RecordError when the level is not in LEVELS."""
     if level not in LEVELS:
         raise RecordError(f"there is no log level {level!r}: choose one of {', '.join(LEVELS)}")
-    message = message_class("foxglove.Log")(level=LEVELS[level], message=printable(text), name=printable(name))
+    message: Log = foxglove("Log").Log(level=LEVELS[level], message=printable(text), name=printable(name))
     message.timestamp.FromNanoseconds(time_ns)
     return message

@@ -16,6 +16,7 @@ import numpy as np
 
 from tmc.record import builders
 from tmc.record.errors import RecordError
+from tmc.record.overfly_pb2 import Episode, Events, FlightRecord, ObservationHashes, Sync, TeamMetrics
 from tmc.record.reader import Log, decode
 from tmc.record.run_folder import run_files
 
@@ -105,11 +106,11 @@ def _read(log: Log) -> Keyed:
             yield (*at, _RANK["map handed out"], TEAM), builders.last_visit(message).tobytes()
         elif raw.schema in _READERS:
             yield from _READERS[raw.schema](message)
-        if raw.schema == "overfly.Sync":
+        if isinstance(message, Sync):
             at = (message.episode, message.tick)
 
 
-def _record(r: Any) -> Keyed:
+def _record(r: FlightRecord) -> Keyed:
     e, i = r.episode, r.uav
     start = max(r.first, 1)
     yield (e, r.tick, _RANK["record"], i), (r.sequence, r.first, r.version, r.policy)
@@ -121,21 +122,21 @@ def _record(r: Any) -> Keyed:
         yield (e, t, _RANK["sightings"], i), tuple(cell for _, cell in seen)
 
 
-def _sync(s: Any) -> Keyed:
+def _sync(s: Sync) -> Keyed:
     yield (s.episode, s.tick, _RANK["sync reply"], TEAM), (s.version, s.policy, *s.uavs[:], s.believed)
 
 
-def _metrics(m: Any) -> Keyed:
+def _metrics(m: TeamMetrics) -> Keyed:
     for kind, values in (("uncertainty", m.uncertainty[:]), ("team's reward", m.reward[:])):
         yield from (((m.episode, t, _RANK[kind], TEAM), value) for t, value in enumerate(values, m.first))
 
 
-def _events(m: Any) -> Keyed:
+def _events(m: Events) -> Keyed:
     for t, events in groupby(zip(m.ticks[:], m.cells[:], strict=True), key=lambda pair: pair[0]):
         yield (m.episode, t, _RANK["events"], TEAM), tuple(cell for _, cell in events)
 
 
-def _episode(m: Any) -> Keyed:
+def _episode(m: Episode) -> Keyed:
     values = tuple((field.name, _plain(value)) for field, value in m.ListFields())
     yield (m.episode, m.ticks, _RANK[f"{m.phase} of the episode"], TEAM), values
 
@@ -144,7 +145,7 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, int | float | str) else tuple(value)
 
 
-def _hashes(m: Any) -> Keyed:
+def _hashes(m: ObservationHashes) -> Keyed:
     first = max(m.first, 1) - 1
     yield from (((m.episode, t, _RANK["observation"], m.uav), value) for t, value in enumerate(m.hashes[:], first))
 

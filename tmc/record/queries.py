@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tmc.record.errors import RecordError
+from tmc.record.overfly_pb2 import Episode, FlightRecord
 from tmc.record.reader import Log, decode
 from tmc.record.run_folder import tmc_log
 
@@ -38,7 +39,7 @@ class Tracks:
         self.episode = episode
         self._cells: dict[int, array[int]] = {}
 
-    def add(self, record: Any) -> None:
+    def add(self, record: FlightRecord) -> None:
         """Add an overfly.FlightRecord; RecordError when it contradicts the cells of an earlier one."""
         cells = self._cells.setdefault(record.uav, array("i"))
         new, first = record.cells[:], record.first
@@ -112,7 +113,7 @@ def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
     return iter(sorted(found[episode]))
 
 
-def episodes(folder: Folder) -> list[Any]:
+def episodes(folder: Folder) -> list[Episode]:
     """Return the overfly.Episode messages, in the order of the log."""
     return list(messages(folder, "overfly.Episode"))
 

@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
+from google.protobuf.message import Message
 from mcap.records import Attachment
 
 from tmc.kernel.config import JournalConfig
@@ -116,7 +117,7 @@ class LogWriter:
             kept = keep_damaged(old).name
             self.log("error", f"{log.damage}: this incarnation resumes before that; the file is kept as {kept}")
 
-    def write(self, topic: str, message: Any, publish_time: int | None = None) -> int:
+    def write(self, topic: str, message: Message, publish_time: int | None = None) -> int:
         """Write a message to a topic and return its log time, ns. Flushes when that is due.
 
         `message`: of the schema that the table has for the topic. `publish_time`: the sender's wall clock, ns; by

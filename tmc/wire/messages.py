@@ -23,7 +23,7 @@ PROTOCOL = 2
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Message:
     """Base of all messages; checks every field against its rule."""
 
@@ -31,7 +31,7 @@ class Message:
         f.check(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Hello(Message):
     """A client introduces itself. `uav`: -1 for the learner. `incarnation`: new each time that a process starts."""
 
@@ -41,7 +41,7 @@ class Hello(Message):
     updates: int = f.integer(0, 2**62, default=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Welcome(Message):
     """The TMC's mission: all settings, the map's fingerprint, the run, and the newest policy version.
 
@@ -57,7 +57,7 @@ class Welcome(Message):
     sequence: int = f.integer(0, 2**62, default=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Begin(Message):
     """Start of a flight: a new episode (`shipped` = -1, tick 0), or the resumed flight of a process that ended.
 
@@ -76,7 +76,7 @@ class Begin(Message):
     lost: Array = f.array("<u2", 65_535)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Record(Message):
     """A flight record: what UAV `uav` did in ticks `first`..`tick` of an episode.
 
@@ -108,7 +108,7 @@ class Record(Message):
     sent: int = f.integer(0, 2**63 - 1, default=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Map(Message):
     """The TMC's answer to record `sequence`: the global map with every visit due by `tick`.
 
@@ -126,7 +126,7 @@ class Map(Message):
     active: Array = f.array("<u2", 65_535)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Alive(Message):
     """UAV `uav` flies at `tick`. `sequence`: of its next record. `peer`: the UAV for which it waits, -1 for none."""
 
@@ -137,7 +137,7 @@ class Alive(Message):
     sequence: int = f.integer(0, 2**62)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Lost(Message):
     """UAV `uav` is lost in this episode. `tick`: end of its last record, -1 without one. Peers stop waiting for it."""
 
@@ -146,14 +146,14 @@ class Lost(Message):
     tick: int = f.integer(-1, 65_535)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PolicyRequest(Message):
     """A UAV asks for the policy with this version."""
 
     version: int = f.integer(0, 2**62)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Policy(Message):
     """A policy file: `model` is an ONNX model that carries its own description."""
 
@@ -161,7 +161,7 @@ class Policy(Message):
     model: bytes = f.blob(64 * 1024 * 1024)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SampleRequest(Message):
     """The learner asks for a minibatch. `request` is repeated in the answer.
 
@@ -176,7 +176,7 @@ class SampleRequest(Message):
     incarnation: int = f.integer(0, 2**63 - 1, default=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Minibatch(Message):
     """`b` transitions (o_t, a_t, o_{t+n}, r), with the content of their observations.
 
@@ -201,7 +201,7 @@ class Minibatch(Message):
     weight: Array = f.tensor("<f4", 1, empty=True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PolicyPush(Message):
     """The learner's policy after `updates` updates. A version that is not newer is refused.
 
@@ -216,14 +216,14 @@ class PolicyPush(Message):
     incarnation: int = f.integer(0, 2**63 - 1, default=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ack(Message):
     """The TMC has accepted the policy with this version."""
 
     version: int = f.integer(0, 2**62)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Beacon(Message):
     """UAV `uav` was on `cells` at `tick` and the ticks after it. The TMC forwards it to the UAVs in `to`.
 
@@ -238,12 +238,12 @@ class Beacon(Message):
     ask: int = f.integer(-1, 65_535, default=-1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StatusRequest(Message):
     """A client asks for the progress of the mission."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Status(Message):
     """Progress of the mission. `phase`: gathering, flying, learning (the learner finishes its updates) or done."""
 
@@ -261,7 +261,7 @@ class Status(Message):
     waiting: str = f.text(1024)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class End(Message):
     """The mission is over: clients leave. `acknowledged`: as in `Map`."""
 
@@ -269,7 +269,7 @@ class End(Message):
     acknowledged: int = f.integer(0, 2**62, default=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Bye(Message):
     """A client leaves in order."""
 
@@ -278,7 +278,7 @@ class Bye(Message):
     reason: str = f.text(1024)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Error(Message):
     """A frame was refused, and changed nothing. `text`: the cause and the fix.
 

@@ -134,7 +134,20 @@ def test_what_matters_least_is_left_out_first() -> None:
 def test_a_narrow_terminal_still_shows_the_tick_and_what_is_waited_for(terminal: Open) -> None:
     out, ours = terminal(40)
     progress = Progress(build({"training.episodes": 12}), 323, 0.0, out)
-    status = Status("flying", 3, 410, 2410, 100, 1, 0.1, 150.0, 160.0, 7, 0, "uav-001")
+    status = Status(
+        phase="flying",
+        episode=3,
+        tick=410,
+        ticks=2410,
+        updates=100,
+        policy=1,
+        loss=0.1,
+        uncertainty=150.0,
+        episode_uncertainty=160.0,
+        blocked=7,
+        rejected=0,
+        waiting="uav-001",
+    )
     progress._recent = [(-10.0, 2410, 100)]
     progress.show(status)
     assert shown(out, ours) == "tick 2,410/12,000 · waiting for uav-001"

@@ -33,8 +33,22 @@ NONE = np.zeros(0, "u1")
 
 def record(uav: int, sequence: int, cell: int = 7) -> m.Record:
     cells = np.array([cell], "<u2")
-    return m.Record(uav, 5, sequence, 1, sequence, sequence, 0, 0, cells, NONE, NONE, np.zeros(0, "<f4"),
-                    m.EMPTY, m.EMPTY)  # fmt: skip
+    return m.Record(
+        uav=uav,
+        incarnation=5,
+        sequence=sequence,
+        episode=1,
+        first=sequence,
+        tick=sequence,
+        version=0,
+        policy=0,
+        cells=cells,
+        actions=NONE,
+        blocks=NONE,
+        rewards=np.zeros(0, "<f4"),
+        seen_tick=m.EMPTY,
+        seen_cell=m.EMPTY,
+    )
 
 
 def prepare(out: Path, journalled: list[m.Record], acknowledged: list[m.Record]) -> None:
@@ -114,7 +128,20 @@ def test_the_rest_of_a_fault_is_postponed_to_the_next_mission(tmp_path: Path) ->
 
 def test_updates_lost_by_a_restart_do_not_reduce_the_growth() -> None:
     growth = Growth()
-    status = m.Status("flying", 1, 10, 10, 100, 1, 0.0, 0.0, 0.0, 0, 0, "")
+    status = m.Status(
+        phase="flying",
+        episode=1,
+        tick=10,
+        ticks=10,
+        updates=100,
+        policy=1,
+        loss=0.0,
+        uncertainty=0.0,
+        episode_uncertainty=0.0,
+        blocked=0,
+        rejected=0,
+        waiting="",
+    )
     for updates in (100, 103, 40, 42):
         growth.update(replace(status, updates=updates))
         growth.update(None)

@@ -12,7 +12,7 @@ from deploy.run.lockstep import run
 from deploy.run.progress import Progress
 from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.world import World
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
 
@@ -66,6 +66,6 @@ def learned(fly: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) 
     flown_as(fly(**{"training.episodes": 3}), folder, {"team.controller": "policy"})
     with LogWriter(folder / "learner.mcap", "learner", JournalConfig(), {}) as log:
         for n in range(1, 181):
-            metrics = schemas.LearnerMetrics(updates=n, loss=1 / n, q_mean=n / 20, target_mean=n / 19)
+            metrics = overfly_pb2.LearnerMetrics(updates=n, loss=1 / n, q_mean=n / 20, target_mean=n / 19)
             log.write("/learner/metrics", metrics)
     return folder

@@ -85,7 +85,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
                 step.fleet.deliver(uav, message)
 
     for pilot in pilots:
-        deliver(step._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)))
+        deliver(step._exchange(pilot.uav, m.Hello(role="uav", uav=pilot.uav, incarnation=1)))
     now = 0.0
     while station.phase != "done":
         assert now < 1e4, "the mission hangs"
@@ -96,7 +96,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
                 if away:
                     continue
                 pilot.episode, pilot.incarnation, pilot.phase = 0, 2, type(pilot.phase).IDLE
-                deliver(step._exchange(2, m.Hello("uav", 2, 2)))
+                deliver(step._exchange(2, m.Hello(role="uav", uav=2, incarnation=2)))
             before = (pilot.t, pilot.phase)
             try:
                 record = pilot.advance()

@@ -17,7 +17,7 @@ from tmc.kernel.config import JournalConfig, build, flat
 from tmc.kernel.roadmap import load_map
 from tmc.kernel.uncertainty import lower_bound
 from tmc.kernel.world import World
-from tmc.record import queries, schemas
+from tmc.record import overfly_pb2, queries
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 from tmc.record.writer import LogWriter
@@ -187,7 +187,7 @@ def test_learner_metrics_count_the_last_time_they_were_done(learned, tmp_path):
     with LogWriter(folder / "learner.mcap", "learner", JournalConfig(), {}) as log:
         for updates, loss in ((10, 1.0), (20, 2.0), (500, 3.0), (20, 7.0)):
             log.write(
-                "/learner/metrics", schemas.LearnerMetrics(updates=updates, loss=loss, q_mean=loss, target_mean=1)
+                "/learner/metrics", overfly_pb2.LearnerMetrics(updates=updates, loss=loss, q_mean=loss, target_mean=1)
             )
     learning = read(folder).learning
     assert learning.updates.tolist() == [10, 20, 500] and learning.loss.tolist() == [1.0, 7.0, 3.0]
@@ -201,7 +201,7 @@ def test_without_the_learners_log_the_tmc_knows_its_policies(learned, tmp_path):
     shutil.copy(learned / "config.json", folder)
     with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for version, (updates, loss) in enumerate(((0, 0.0), (100, 0.5), (150, 0.25)), 1):
-            log.write("/learner/policy", schemas.Policy(version=version, updates=updates, loss=loss))
+            log.write("/learner/policy", overfly_pb2.Policy(version=version, updates=updates, loss=loss))
         for entry in Log(learned / "tmc.mcap").entries():
             log.write(entry.topic, entry.message)
     s = summary(folder)
@@ -314,7 +314,7 @@ def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, t
     journal = Journal(tmp_path, world := World(config), "run")
     mission = LockStep(world, None, journal.take)
     for i in (0, 1):
-        for to, message in mission._exchange(i, Hello("uav", i, 1)):
+        for to, message in mission._exchange(i, Hello(role="uav", uav=i, incarnation=1)):
             mission.fleet.deliver(to, message)
     mission.fleet.pilots[1].advance = lambda: None
     station, now = mission.station, 100.0

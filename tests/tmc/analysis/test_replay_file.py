@@ -330,7 +330,7 @@ def losing(mission: LockStep) -> None:
     """Fly a mission in which UAV 1 says nothing more from tick 25 of episode 1 on."""
     fleet, station, now = mission.fleet, mission.station, 0.0
     for pilot in fleet.pilots:
-        for uav, reply in mission._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)):
+        for uav, reply in mission._exchange(pilot.uav, m.Hello(role="uav", uav=pilot.uav, incarnation=1)):
             fleet.deliver(uav, reply)
     while station.episode is None or station.episode.number == 1:
         moved = False

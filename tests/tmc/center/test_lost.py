@@ -47,7 +47,7 @@ class Losing:
     def fly(self) -> Losing:
         fleet, self.dead = self.step.fleet, False
         for pilot in fleet.pilots:
-            self.deliver(self.step._exchange(pilot.uav, m.Hello("uav", pilot.uav, 1)))
+            self.deliver(self.step._exchange(pilot.uav, m.Hello(role="uav", uav=pilot.uav, incarnation=1)))
         now, stuck = 0.0, 0
         while self.step.station.phase != "done":
             moved = False
@@ -56,7 +56,7 @@ class Losing:
                     self.dead = True
                     if self.step.station.episode is not None and self.step.station.episode.number == 2:
                         self.dead = False
-                        self.deliver(self.step._exchange(LOST, m.Hello("uav", LOST, 2)))
+                        self.deliver(self.step._exchange(LOST, m.Hello(role="uav", uav=LOST, incarnation=2)))
                         pilot.incarnation, pilot.phase = 2, type(pilot.phase).IDLE
                         pilot.episode = 0
                     continue
@@ -171,7 +171,7 @@ def flown_to(tick: int, **values: Any) -> LockStep:
     settings = {"team.controller": "planner:greedy", "team.size": N, "training.ticks": 90, "comms.period": 7}
     step = LockStep(World(build({**settings, "replay.learn_start": 1, **values})), None, lambda _: None)
     for i in range(N):
-        for uav, reply in step._exchange(i, m.Hello("uav", i, 1)):
+        for uav, reply in step._exchange(i, m.Hello(role="uav", uav=i, incarnation=1)):
             step.fleet.deliver(uav, reply)
     while step.fleet.pilots[0].t < tick:
         step.fleet.step()
@@ -194,11 +194,25 @@ def test_a_zombie_is_not_listened_to_and_is_back_with_the_next_episode() -> None
     mission = Losing(20, **{"training.episodes": 2})
     station = mission.step.station
     for i in range(N):
-        mission.step._exchange(i, m.Hello("uav", i, 1))
+        mission.step._exchange(i, m.Hello(role="uav", uav=i, incarnation=1))
     station.tick(1000.0)
     assert all(member.incarnation < 0 for member in station.roster)
-    record = m.Record(0, 1, 0, 1, 0, 0, 0, 0, np.array([station.world.starts(1)[0]], "<u2"), *[np.zeros(0, "u1")] * 2,
-                      np.zeros(0, "<f4"), m.EMPTY, m.EMPTY)  # fmt: skip
+    record = m.Record(
+        uav=0,
+        incarnation=1,
+        sequence=0,
+        episode=1,
+        first=0,
+        tick=0,
+        version=0,
+        policy=0,
+        cells=np.array([station.world.starts(1)[0]], "<u2"),
+        actions=np.zeros(0, "u1"),
+        blocks=np.zeros(0, "u1"),
+        rewards=np.zeros(0, "<f4"),
+        seen_tick=m.EMPTY,
+        seen_cell=m.EMPTY,
+    )
     station.out.take()
     station.handle(uav_name(0), record, 1001.0)
     assert [(to, getattr(x, "code", "")) for to, x in station.out.take().sends] == [("uav-000", "state")]
@@ -244,7 +258,7 @@ def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
     step = flown_to(35, **{"replay.capacity": 80, "training.episodes": 1})
     replay, feed = step.station.replay, step.station.sample_queue
     step.station.rate_limiter.ratio, feed.incarnation = 1.0, 1
-    assert len(replay) == 80 and feed.ask(m.SampleRequest(1)) is None
+    assert len(replay) == 80 and feed.ask(m.SampleRequest(request=1)) is None
     step.station.tick(1000.0)
     step.station.finalise()
     assert len(replay) == 0 and step.station.rate_limiter.samples_due

@@ -100,11 +100,14 @@ class Learner:
         self.push()
 
     def hello(self) -> m.Hello:
-        return m.Hello("learner", -1, self.incarnation, self.updates)
+        return m.Hello(role="learner", uav=-1, incarnation=self.incarnation, updates=self.updates)
 
     def push(self) -> None:
         self.version = max(self.version, self.flown.station.policies.newest) + 1
-        self.flown.tell(LEARNER, m.PolicyPush(self.version, self.updates, 0.5, b"policy %d" % self.version))
+        self.flown.tell(
+            LEARNER,
+            m.PolicyPush(version=self.version, updates=self.updates, loss=0.5, model=b"policy %d" % self.version),
+        )
 
     def work(self) -> None:
         """Take what came, and ask for more."""
@@ -116,7 +119,7 @@ class Learner:
         self.flown.learner.clear()
         while self.open < 2:
             self.open += 1
-            self.flown.tell(LEARNER, m.SampleRequest(self.updates + self.open))
+            self.flown.tell(LEARNER, m.SampleRequest(request=self.updates + self.open))
 
 
 @dataclass
@@ -270,10 +273,10 @@ def test_a_journal_cut_anywhere_gives_the_state_and_goes_on(
 def greet(station: Station, reference: Station, updates: int) -> None:
     """Make all UAVs that were there say hello again."""
     if reference.learning and reference.sample_queue.incarnation >= 0:
-        station.handle(LEARNER, m.Hello("learner", -1, 1, updates), 1.0)
+        station.handle(LEARNER, m.Hello(role="learner", uav=-1, incarnation=1, updates=updates), 1.0)
     for i, member in enumerate(reference.roster):
         if member.incarnation >= 0:
-            station.handle(uav_name(i), m.Hello("uav", i, member.incarnation), 1.0)
+            station.handle(uav_name(i), m.Hello(role="uav", uav=i, incarnation=member.incarnation), 1.0)
 
 
 # Killed in episode.
@@ -443,7 +446,7 @@ def test_policy_files(mission: Callable[..., Any], town: RoadMap, tmp_path: Path
     assert station.policies.newest == newest
     found = station.policies.find(newest)
     assert found == ((newest, b"policy %d" % newest) if file == "whole" else None)
-    station.handle(LEARNER, m.PolicyPush(newest + 1, 9, 0.5, b"next"), 1.0)
+    station.handle(LEARNER, m.PolicyPush(version=newest + 1, updates=9, loss=0.5, model=b"next"), 1.0)
     assert station.policies.find(newest) == (found or (newest + 1, b"next"))
 
 
@@ -471,7 +474,7 @@ def test_a_process_that_has_flown_nothing_yet_is_missed_too(flown: Any, tmp_path
     path = journalled(tmp_path / "run", flown.world, flown.entries[: at(flown.entries, "/tmc/episode", 0) + 1])
     station = Station(flown.world, "run", learning=False, policy=b"policy")
     recovery.recover(station, path, 100.0)
-    station.handle("uav-000", m.Hello("uav", 0, 5), 150.0)
+    station.handle("uav-000", m.Hello(role="uav", uav=0, incarnation=5), 150.0)
     station.tick(159.0)
     assert station.episode is not None and station.episode.lost == {}
     station.tick(161.0)
@@ -495,7 +498,7 @@ def test_a_finished_mission_says_goodbye_to_whoever_comes(flown: Any, tmp_path: 
     station = Station(flown.world, "run", learning=False, policy=b"policy")
     assert recovery.recover(station, path, 1.0) == []
     assert station.phase == "done"
-    station.handle("uav-001", m.Hello("uav", 1, 5), 1.0)
+    station.handle("uav-001", m.Hello(role="uav", uav=1, incarnation=5), 1.0)
     assert [type(x) for to, x in station.out.take().sends] == [m.Welcome, m.End]
 
 

@@ -29,7 +29,7 @@ def started_again(flown: Any, incarnation: int = 1) -> Station:
     """A station that knows nothing yet of what was flown."""
     station = Station(flown.world, "run", learning=False)
     for i in range(flown.N):
-        station.handle(uav_name(i), m.Hello("uav", i, incarnation), 1.0)
+        station.handle(uav_name(i), m.Hello(role="uav", uav=i, incarnation=incarnation), 1.0)
     station.out.take()
     return station
 
@@ -68,7 +68,7 @@ def test_a_new_process_is_not_answered_by_what_the_old_one_said_early(flown: Any
     mine = [r for r in flown.records if r.uav == 0]
     told(station, mine[:3])
     assert station.reorder_buffer.count(0) == 3 - station.roster[0].sequence > 0
-    station.handle("uav-000", m.Hello("uav", 0, 2), 3.0)
+    station.handle("uav-000", m.Hello(role="uav", uav=0, incarnation=2), 3.0)
     assert station.reorder_buffer.count(0) == 0
     again = [replace(r, incarnation=2) for r in mine[station.roster[0].sequence :]]
     others = [r for r in flown.records if r.uav != 0]
@@ -95,7 +95,7 @@ def test_early_records_have_an_end(flown: Any) -> None:
 
 def alive(station: Station, **more: int) -> list[m.Message]:
     """What the station says to UAV 0 that is alive."""
-    station.handle("uav-000", replace(m.Alive(0, 1, 20, 2, 0), **more), 2.0)
+    station.handle("uav-000", replace(m.Alive(uav=0, incarnation=1, tick=20, peer=2, sequence=0), **more), 2.0)
     return [x for to, x in station.out.take().sends if to == "uav-000"]
 
 
@@ -118,7 +118,7 @@ def test_a_process_that_said_hello_to_an_earlier_life_of_the_tmc_is_not_fenced(f
     station.handle("uav-000", replace(mine, incarnation=7), 2.0)
     (error,) = (x for _, x in station.out.take().sends)
     assert isinstance(error, m.Error) and error.code == "state"
-    station.handle("uav-000", m.Hello("uav", 0, 7), 2.0)
+    station.handle("uav-000", m.Hello(role="uav", uav=0, incarnation=7), 2.0)
     station.out.take()
     told(station, [replace(mine, incarnation=7)])
     station.handle("uav-000", replace(mine, incarnation=1), 2.0)
@@ -130,13 +130,13 @@ def test_the_next_process_flies_the_policy_of_the_last_one(town: RoadMap) -> Non
     """Peers may have seen what the last one flew by it, so a newer policy has to wait for the next exchange."""
     config = build({**VALUES, "team.controller": "policy", "team.size": 1})
     station = Station(World(config, town), "run", learning=True)
-    station.handle("learner", m.Hello("learner", -1, 5), 1.0)
-    station.handle("learner", m.PolicyPush(1, 0, 0.0, b"one"), 1.0)
-    station.handle("uav-000", m.Hello("uav", 0, 1), 1.0)
+    station.handle("learner", m.Hello(role="learner", uav=-1, incarnation=5), 1.0)
+    station.handle("learner", m.PolicyPush(version=1, updates=0, loss=0.0, model=b"one"), 1.0)
+    station.handle("uav-000", m.Hello(role="uav", uav=0, incarnation=1), 1.0)
     assert [x.policy for _, x in station.out.take().sends if isinstance(x, m.Begin)] == [1]
-    station.handle("learner", m.PolicyPush(2, 9, 0.0, b"two"), 1.0)
-    station.handle("learner", m.PolicyPush(3, 10, 0.0, b"three"), 1.0)
-    station.handle("uav-000", m.Hello("uav", 0, 2), 2.0)
+    station.handle("learner", m.PolicyPush(version=2, updates=9, loss=0.0, model=b"two"), 1.0)
+    station.handle("learner", m.PolicyPush(version=3, updates=10, loss=0.0, model=b"three"), 1.0)
+    station.handle("uav-000", m.Hello(role="uav", uav=0, incarnation=2), 2.0)
     assert [x.policy for _, x in station.out.take().sends if isinstance(x, m.Begin)] == [1]
-    station.handle("uav-000", m.PolicyRequest(1), 2.0)
-    assert [x for _, x in station.out.take().sends] == [m.Policy(1, b"one")]
+    station.handle("uav-000", m.PolicyRequest(version=1), 2.0)
+    assert [x for _, x in station.out.take().sends] == [m.Policy(version=1, model=b"one")]

@@ -30,10 +30,10 @@ def feed_of(mission: Callable[..., Any], town: RoadMap, values: dict[str, Any] =
 def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., Any], town: RoadMap) -> None:
     """A request that waited for a TMC to come back: the learner must first hear that the numbers may begin again."""
     sample_queue = feed_of(mission, town)
-    assert sample_queue.ask(SampleRequest(1)) is None and list(sample_queue.serve(0, 0)) == []
-    sample_queue.welcome(Hello("learner", -1, 9))
+    assert sample_queue.ask(SampleRequest(request=1)) is None and list(sample_queue.serve(0, 0)) == []
+    sample_queue.welcome(Hello(role="learner", uav=-1, incarnation=9))
     assert list(sample_queue.serve(0, 0)) == []  # it asks again
-    assert sample_queue.ask(SampleRequest(2)) is None
+    assert sample_queue.ask(SampleRequest(request=2)) is None
     (minibatch,) = sample_queue.serve(1, 20)
     assert (minibatch.request, minibatch.episodes, minibatch.ticks) == (2, 0, 20)
     s = sample_queue.replay.sample(0, 4)
@@ -43,7 +43,7 @@ def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., 
 
 def test_only_so_many_requests_are_taken(mission: Callable[..., Any], town: RoadMap) -> None:
     sample_queue = feed_of(mission, town)
-    assert [sample_queue.ask(SampleRequest(n)) is None for n in range(WINDOW + 1)] == [True] * WINDOW + [False]
+    assert [sample_queue.ask(SampleRequest(request=n)) is None for n in range(WINDOW + 1)] == [True] * WINDOW + [False]
 
 
 def test_a_learner_that_makes_up_for_what_it_lost_hears_of_the_episodes_in_their_turn(
@@ -52,10 +52,10 @@ def test_a_learner_that_makes_up_for_what_it_lost_hears_of_the_episodes_in_their
     """Or theta- would not follow until it is done: the team waits for it, and no episode ends meanwhile."""
     sample_queue = feed_of(mission, town)
     sample_queue.rate_limiter.insert(4 * 20 - sample_queue.rate_limiter.ticks, 60)
-    sample_queue.welcome(Hello("learner", -1, 9))
+    sample_queue.welcome(Hello(role="learner", uav=-1, incarnation=9))
     told = []
     while sample_queue.rate_limiter.samples_due:
-        assert sample_queue.ask(SampleRequest(len(told))) is None
+        assert sample_queue.ask(SampleRequest(request=len(told))) is None
         told += [minibatch.episodes for minibatch in sample_queue.serve(4, 80)]
     assert told == [tick // 20 for tick in range(2, 81)]  # learning started after the first tick
 
@@ -64,7 +64,7 @@ PRIORITISED = {**VALUES, "team.controller": "policy", "replay.priority_exponent"
 
 
 def request_with_errors(request: int, index: list[int], errors: list[float]) -> SampleRequest:
-    return SampleRequest(request, np.array(index, "<i8"), np.array(errors, "<f4"))
+    return SampleRequest(request=request, index=np.array(index, "<i8"), errors=np.array(errors, "<f4"))
 
 
 def test_errors_become_priorities_once_the_learner_is_welcome(mission: Callable[..., Any], town: RoadMap) -> None:
@@ -75,7 +75,7 @@ def test_errors_become_priorities_once_the_learner_is_welcome(mission: Callable[
     before = priorities.mass(np.arange(60)).tolist()
     assert sample_queue.ask(request_with_errors(1, [7, 8], [25.0, 0.0])) is None
     assert priorities.mass(np.arange(60)).tolist() == before
-    sample_queue.welcome(Hello("learner", -1, 9))
+    sample_queue.welcome(Hello(role="learner", uav=-1, incarnation=9))
     assert sample_queue.ask(request_with_errors(2, [7, 8, 9999], [25.0, 0.0, 1.0])) is None  # the last one is not held
     after = priorities.mass(np.arange(60))
     assert after[[7, 8]] == pytest.approx([(25 + EPSILON) ** 0.5, EPSILON**0.5])
@@ -91,7 +91,7 @@ def test_errors_that_cannot_be_change_nothing(
     mission: Callable[..., Any], town: RoadMap, index: list[int], errors: list[float]
 ) -> None:
     sample_queue = feed_of(mission, town, PRIORITISED)
-    sample_queue.welcome(Hello("learner", -1, 9))
+    sample_queue.welcome(Hello(role="learner", uav=-1, incarnation=9))
     assert sample_queue.replay.priorities is not None
     before = sample_queue.replay.priorities.mass(np.arange(60)).tolist()
     assert "an error for each transition" in str(sample_queue.ask(request_with_errors(1, index, errors)))
@@ -101,5 +101,5 @@ def test_errors_that_cannot_be_change_nothing(
 
 def test_errors_are_refused_where_nobody_asked_for_them(mission: Callable[..., Any], town: RoadMap) -> None:
     sample_queue = feed_of(mission, town)
-    sample_queue.welcome(Hello("learner", -1, 9))
+    sample_queue.welcome(Hello(role="learner", uav=-1, incarnation=9))
     assert "replay.priority_exponent is 0" in str(sample_queue.ask(request_with_errors(1, [1], [0.5])))

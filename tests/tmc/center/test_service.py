@@ -84,7 +84,7 @@ class Uav:
         tracks = TableTracks(TrackTable(1, world.config.training.ticks), 0)
         planner = None if world.config.team.controller == "policy" else Hovers()
         self.pilot = Pilot(world, 0, incarnation, tracks, ObservationBuilder(world), lambda _: Hovers(), planner)
-        client.say(m.Hello("uav", 0, incarnation))
+        client.say(m.Hello(role="uav", uav=0, incarnation=incarnation))
         self.begin = client.hear(m.Begin)
         self._obey(self.pilot.on_begin(self.begin))
 
@@ -105,7 +105,9 @@ class Uav:
 
 def push(learner: Client, version: int) -> None:
     """A new policy, and the TMC has it."""
-    learner.say(m.PolicyPush(version, 100 * version, 0.0, b"policy %d" % version), m.StatusRequest())
+    learner.say(
+        m.PolicyPush(version=version, updates=100 * version, loss=0.0, model=b"policy %d" % version), m.StatusRequest()
+    )
     learner.hear(m.Status)
 
 
@@ -237,7 +239,7 @@ def test_a_loss_is_committed_before_anybody_is_told(client: Callable[[str], Clie
     silent = World(build({**VALUES, "comms.lost_after": 1.0, "team.controller": "planner:greedy"}))
     with killed_in_the_end(silent, tmp_path):
         uav = client("uav-000")
-        uav.say(m.Hello("uav", 0, 1))
+        uav.say(m.Hello(role="uav", uav=0, incarnation=1))
         uav.hear(m.Lost)
     left = journal_in(tmp_path)
     assert left is not None

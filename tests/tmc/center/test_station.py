@@ -52,7 +52,7 @@ def kinds(sends: list[tuple[str, m.Message]]) -> list[tuple[str, str]]:
 
 
 def hello(station: Station, i: int, incarnation: int = 1) -> list[tuple[str, m.Message]]:
-    station.handle(uav_name(i), m.Hello("uav", i, incarnation), 1.0)
+    station.handle(uav_name(i), m.Hello(role="uav", uav=i, incarnation=incarnation), 1.0)
     return sent(station)
 
 
@@ -61,7 +61,22 @@ def first_record(station: Station, i: int, incarnation: int = 1, **fields: Any) 
     assert station.episode is not None
     none = np.zeros(0, "u1")
     cells = np.array([station.episode.starts[i]], "<u2")
-    record = m.Record(i, incarnation, 0, 1, 0, 0, 0, 0, cells, none, none, np.zeros(0, "<f4"), m.EMPTY, m.EMPTY)
+    record = m.Record(
+        uav=i,
+        incarnation=incarnation,
+        sequence=0,
+        episode=1,
+        first=0,
+        tick=0,
+        version=0,
+        policy=0,
+        cells=cells,
+        actions=none,
+        blocks=none,
+        rewards=np.zeros(0, "<f4"),
+        seen_tick=m.EMPTY,
+        seen_cell=m.EMPTY,
+    )
     return dataclasses.replace(record, **fields)
 
 
@@ -73,7 +88,22 @@ def next_record(station: Station, i: int, first: int, tick: int, sequence: int, 
     moves = tick - max(first, 1) + 1
     stay, zero = np.full(moves, 8, "u1"), np.zeros(moves, "u1")
     reward = np.zeros(moves, "<f4")
-    return m.Record(i, incarnation, sequence, 1, first, tick, 0, 0, cells, stay, zero, reward, m.EMPTY, m.EMPTY)
+    return m.Record(
+        uav=i,
+        incarnation=incarnation,
+        sequence=sequence,
+        episode=1,
+        first=first,
+        tick=tick,
+        version=0,
+        policy=0,
+        cells=cells,
+        actions=stay,
+        blocks=zero,
+        rewards=reward,
+        seen_tick=m.EMPTY,
+        seen_cell=m.EMPTY,
+    )
 
 
 def state(station: Station) -> bytes:
@@ -140,15 +170,15 @@ def test_learning_uavs_wait_for_a_policy(station_of: Callable[..., Station]) -> 
     hello(station, 0)
     hello(station, 1)
     assert station.phase == "gathering" and station.waiting_for() == ["learner"]
-    station.handle(LEARNER, m.Hello("learner", -1, 5), 1.0)
+    station.handle(LEARNER, m.Hello(role="learner", uav=-1, incarnation=5), 1.0)
     assert kinds(sent(station)) == [("learner", "Welcome")]
-    station.handle(LEARNER, m.PolicyPush(1, 0, 0.0, b"theta"), 1.0)
+    station.handle(LEARNER, m.PolicyPush(version=1, updates=0, loss=0.0, model=b"theta"), 1.0)
     sends = sent(station)
     assert kinds(sends) == [("learner", "Ack"), ("uav-000", "Begin"), ("uav-001", "Begin")]
     assert sends[1][1].policy == 1  # type: ignore[attr-defined]
-    station.handle("uav-000", m.PolicyRequest(1), 1.0)
+    station.handle("uav-000", m.PolicyRequest(version=1), 1.0)
     (to, policy), *_ = sent(station)
-    assert (to, policy) == ("uav-000", m.Policy(1, b"theta"))
+    assert (to, policy) == ("uav-000", m.Policy(version=1, model=b"theta"))
 
 
 def test_planners_do_not_wait_for_the_learner(station_of: Callable[..., Station]) -> None:
@@ -162,11 +192,16 @@ def test_planners_do_not_wait_for_the_learner(station_of: Callable[..., Station]
 
 def test_strangers_are_refused(station_of: Callable[..., Station]) -> None:
     station = station_of()
-    rejects(station, "uav-002", m.Hello("uav", 2, 1), "refused", "UAV 2")
-    rejects(station, "uav-000", m.Hello("uav", -1, 1), "refused", "UAV -1")
-    rejects(station, LEARNER, m.Hello("learner", -1, 1), "refused", "learner")
-    rejects(station, "observer-1", m.PolicyRequest(1), "state", "no policy 1")
-    for message in (m.Ack(1), m.End("x"), m.Welcome("", "", "", "", 0), m.Error("state", "x")):
+    rejects(station, "uav-002", m.Hello(role="uav", uav=2, incarnation=1), "refused", "UAV 2")
+    rejects(station, "uav-000", m.Hello(role="uav", uav=-1, incarnation=1), "refused", "UAV -1")
+    rejects(station, LEARNER, m.Hello(role="learner", uav=-1, incarnation=1), "refused", "learner")
+    rejects(station, "observer-1", m.PolicyRequest(version=1), "state", "no policy 1")
+    for message in (
+        m.Ack(version=1),
+        m.End(reason="x"),
+        m.Welcome(config="", map="", run="", tracks="", policy=0),
+        m.Error(code="state", text="x"),
+    ):
         rejects(station, "observer-1", message, "state", "not a message for the TMC")
 
 
@@ -174,12 +209,12 @@ def test_nobody_says_hello_for_another(station_of: Callable[..., Station]) -> No
     """A process that took the wrong number must not fence the right one."""
     station = station_of()
     hello(station, 0)
-    rejects(station, "uav-001", m.Hello("uav", 0, 7), "refused", "uav-001")
+    rejects(station, "uav-001", m.Hello(role="uav", uav=0, incarnation=7), "refused", "uav-001")
 
 
 def test_only_the_learner_says_hello_as_the_learner(station_of: Callable[..., Station]) -> None:
     station = station_of(learning=True)
-    rejects(station, "uav-001", m.Hello("learner", -1, 7), "refused", "uav-001")
+    rejects(station, "uav-001", m.Hello(role="learner", uav=-1, incarnation=7), "refused", "uav-001")
 
 
 # Records.
@@ -286,13 +321,13 @@ def test_an_old_life_is_fenced(flying: Station) -> None:
 def test_an_old_life_cannot_come_back(flying: Station) -> None:
     """A process that hung while its successor took over says hello when it wakes up: it must not fence the new one."""
     hello(flying, 0, incarnation=2)
-    rejects(flying, "uav-000", m.Hello("uav", 0, 1), "fenced", "newer process flies uav-000")
+    rejects(flying, "uav-000", m.Hello(role="uav", uav=0, incarnation=1), "fenced", "newer process flies uav-000")
     flying.handle("uav-000", first_record(flying, 0, incarnation=2), 2.0)
     assert flying.episode is not None and flying.episode.reported == [0, -1]
 
 
 def test_a_beacon_reaches_those_it_names(flying: Station) -> None:
-    beacon = m.Beacon(0, 1, 3, np.array([7], "<u2"), np.array([0, 1, 5], "<u2"))
+    beacon = m.Beacon(uav=0, episode=1, tick=3, cells=np.array([7], "<u2"), to=np.array([0, 1, 5], "<u2"))
     flying.handle("uav-000", beacon, 1.0)
     assert sent(flying) == [("uav-001", beacon)]
     rejects(flying, "uav-001", beacon, "refused", "cannot send a beacon of UAV 0")
@@ -323,7 +358,7 @@ def test_a_silent_uav_is_named_once(flying: Station) -> None:
     flying.tick(1.1 + patience)
     ((level, text),) = flying.out.take().notes
     assert level == "WARNING" and "uav-001" in text and "tick 0" in text and "30 s" in text
-    flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 34.0)
+    flying.handle("uav-000", m.Alive(uav=0, incarnation=1, tick=0, peer=1, sequence=0), 34.0)
     flying.tick(50.0)
     assert flying.out.take().notes == []
     flying.handle("uav-000", first_record(flying, 0), 51.0)  # as its service does while it waits
@@ -343,10 +378,10 @@ def test_who_waits_for_a_lost_uav_is_told_again_that_it_is_lost(flying: Station)
     assert flying.episode is not None
     flying.lose(flying.episode, 1)
     flying.out.take()
-    flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 5.0)
+    flying.handle("uav-000", m.Alive(uav=0, incarnation=1, tick=0, peer=1, sequence=0), 5.0)
     ((to, lost),) = flying.out.take().sends
-    assert to == "uav-000" and lost == m.Lost(1, 1, -1)
-    flying.handle("uav-000", m.Alive(0, 1, 0, -1, 0), 6.0)
+    assert to == "uav-000" and lost == m.Lost(episode=1, uav=1, tick=-1)
+    flying.handle("uav-000", m.Alive(uav=0, incarnation=1, tick=0, peer=-1, sequence=0), 6.0)
     assert flying.out.take().sends == []
 
 
@@ -367,8 +402,8 @@ def test_who_shares_no_table_is_told_where_a_lost_uav_was(station_of: Callable[.
     station.lose(station.episode, 1)
     told = [message for to, message in sent(station) if to == "uav-000"]
     cells = np.full(4, station.episode.starts[1], "<u2")
-    beacons = [] if tracks else [m.Beacon(1, 1, 1, cells, np.array([0], "<u2"))]
-    assert [frames(x) for x in told] == [frames(x) for x in (*beacons, m.Lost(1, 1, 4))]
+    beacons = [] if tracks else [m.Beacon(uav=1, episode=1, tick=1, cells=cells, to=np.array([0], "<u2"))]
+    assert [frames(x) for x in told] == [frames(x) for x in (*beacons, m.Lost(episode=1, uav=1, tick=4))]
     again = [message for _, message in hello(station, 0, incarnation=2)]  # its next process is told before it flies on
     assert [type(x) for x in again] == [m.Welcome, *(type(x) for x in beacons), m.Begin, m.Map]
 
@@ -391,11 +426,11 @@ def test_a_lost_uav_that_is_there_after_all_is_lost_once_and_has_no_part_in_the_
     patience = flying.config.comms.lost_after
     flying.lose(flying.episode, 1)
     flying.out.take()
-    flying.handle("uav-001", m.Alive(1, 1, 0, -1, 0), 5.0)
+    flying.handle("uav-001", m.Alive(uav=1, incarnation=1, tick=0, peer=-1, sequence=0), 5.0)
     assert kinds(flying.out.take().sends) == [("uav-001", "Error")]
-    flying.handle("uav-001", m.Hello("uav", 1, 1), 6.0)
+    flying.handle("uav-001", m.Hello(role="uav", uav=1, incarnation=1), 6.0)
     assert kinds(flying.out.take().sends) == [("uav-001", "Welcome")]
-    flying.handle("uav-000", m.Alive(0, 1, 0, -1, 0), 6.0 + patience)
+    flying.handle("uav-000", m.Alive(uav=0, incarnation=1, tick=0, peer=-1, sequence=0), 6.0 + patience)
     flying.tick(7.0 + patience)
     assert flying.out.take().entries == [] and away(flying.roster) == [1]
     flying.episode = None
@@ -404,7 +439,7 @@ def test_a_lost_uav_that_is_there_after_all_is_lost_once_and_has_no_part_in_the_
 
 
 def test_what_is_to_be_said_outlasts_the_writing_of_the_journal() -> None:
-    out = Outbox([("uav-000", m.End("over"))], [], [("INFO", "a note")])
+    out = Outbox([("uav-000", m.End(reason="over"))], [], [("INFO", "a note")])
     assert out.take_entries().notes == [("INFO", "a note")] and out.notes == []
     assert kinds(out.take_sends()) == [("uav-000", "End")]
 
@@ -412,8 +447,8 @@ def test_what_is_to_be_said_outlasts_the_writing_of_the_journal() -> None:
 def test_a_uav_that_came_back_can_be_named_again(flying: Station) -> None:
     flying.tick(40.0)
     assert len(flying.out.take().notes) == 2
-    flying.handle("uav-001", m.Hello("uav", 1, 2), 41.0)
-    flying.handle("uav-000", m.Alive(0, 1, 0, 1, 0), 60.0)
+    flying.handle("uav-001", m.Hello(role="uav", uav=1, incarnation=2), 41.0)
+    flying.handle("uav-000", m.Alive(uav=0, incarnation=1, tick=0, peer=1, sequence=0), 60.0)
     flying.out.take()
     flying.tick(62.0)
     assert flying.out.take().notes == []
@@ -431,8 +466,8 @@ class Learning:
         self.station = station
         hello(station, 0)
         hello(station, 1)
-        station.handle(LEARNER, m.Hello("learner", -1, 5), 1.0)
-        station.handle(LEARNER, m.PolicyPush(1, 0, 0.0, b"one"), 1.0)
+        station.handle(LEARNER, m.Hello(role="learner", uav=-1, incarnation=5), 1.0)
+        station.handle(LEARNER, m.PolicyPush(version=1, updates=0, loss=0.0, model=b"one"), 1.0)
         self.sequence = 0
         sent(station)
 
@@ -453,7 +488,7 @@ class Learning:
 
     def ask(self, *requests: int) -> list[tuple[str, m.Message]]:
         for request in requests:
-            self.station.handle(LEARNER, m.SampleRequest(request), 1.0)
+            self.station.handle(LEARNER, m.SampleRequest(request=request), 1.0)
         return sent(self.station)
 
 
@@ -511,7 +546,7 @@ def test_the_next_episode_does_not_get_around_the_limiter(learning: Learning) ->
     last = dataclasses.replace(next_record(learning.station, 0, first - 4, T, learning.sequence - 1), episode=1)
     learning.station.handle("uav-000", last, 1.0)
     assert sent(learning.station) == []
-    learning.station.handle("uav-001", m.Hello("uav", 1, 99), 1.0)
+    learning.station.handle("uav-001", m.Hello(role="uav", uav=1, incarnation=99), 1.0)
     assert kinds(sent(learning.station)) == [("uav-001", "Welcome")]
     sends = [send for n in range(learning.station.rate_limiter.samples_due) for send in learning.ask(n)]
     assert {(to, x.episode) for to, x in sends if isinstance(x, m.Begin)} == {("uav-000", 2), ("uav-001", 2)}
@@ -519,51 +554,75 @@ def test_the_next_episode_does_not_get_around_the_limiter(learning: Learning) ->
 
 def test_there_is_one_learner_and_who_it_replaced_is_told_so(learning: Learning) -> None:
     station = learning.station
-    station.handle(LEARNER, m.Hello("learner", -1, 6), 1.0)
+    station.handle(LEARNER, m.Hello(role="learner", uav=-1, incarnation=6), 1.0)
     assert kinds(sent(station)) == [("learner", "Welcome")]
     for late in (
-        m.Hello("learner", -1, 5, 900),
-        m.PolicyPush(7, 9, 0.0, b"late", incarnation=5),
-        m.SampleRequest(3, incarnation=5),
+        m.Hello(role="learner", uav=-1, incarnation=5, updates=900),
+        m.PolicyPush(version=7, updates=9, loss=0.0, model=b"late", incarnation=5),
+        m.SampleRequest(request=3, incarnation=5),
     ):
         station.handle(LEARNER, late, 1.0)
         ((to, error),) = sent(station)
         assert to == LEARNER and isinstance(error, m.Error) and (error.code, error.incarnation) == ("fenced", 5)
     assert station.policies.newest == 1
-    station.handle(LEARNER, m.PolicyPush(2, 0, 0.0, b"mine", incarnation=6), 1.0)
+    station.handle(LEARNER, m.PolicyPush(version=2, updates=0, loss=0.0, model=b"mine", incarnation=6), 1.0)
     assert kinds(sent(station)) == [("learner", "Ack")] and station.policies.newest == 2
 
 
 def test_at_most_eight_requests_are_in_flight(learning: Learning) -> None:
     assert learning.ask(*range(8)) == []
-    rejects(learning.station, LEARNER, m.SampleRequest(8), "refused", "more than 8")
+    rejects(learning.station, LEARNER, m.SampleRequest(request=8), "refused", "more than 8")
 
 
 def test_errors_that_cannot_be_are_refused(learning: Learning, station_of: Callable[..., Station]) -> None:
     index, errors = np.arange(4), np.ones(3, "<f4")
     on = Learning(station_of({**LEARN, "replay.priority_exponent": 0.6}, learning=True)).station
-    rejects(on, LEARNER, m.SampleRequest(1, index, errors), "refused", "an error for each transition")
     rejects(
-        learning.station, LEARNER, m.SampleRequest(1, index[:3], errors), "refused", "replay.priority_exponent is 0"
+        on, LEARNER, m.SampleRequest(request=1, index=index, errors=errors), "refused", "an error for each transition"
+    )
+    rejects(
+        learning.station,
+        LEARNER,
+        m.SampleRequest(request=1, index=index[:3], errors=errors),
+        "refused",
+        "replay.priority_exponent is 0",
     )
 
 
 def test_only_the_learner_learns(learning: Learning, flying: Station) -> None:
     for sender in ("uav-000", "observer-1"):
-        rejects(learning.station, sender, m.SampleRequest(1), "refused", "only the learner")
-        rejects(learning.station, sender, m.PolicyPush(9, 1, 0.0, b"x"), "refused", "only the learner")
-    rejects(flying, LEARNER, m.SampleRequest(1), "refused", "only the learner")
-    rejects(flying, LEARNER, m.PolicyPush(1, 1, 0.0, b"x"), "refused", "only the learner")
+        rejects(learning.station, sender, m.SampleRequest(request=1), "refused", "only the learner")
+        rejects(
+            learning.station,
+            sender,
+            m.PolicyPush(version=9, updates=1, loss=0.0, model=b"x"),
+            "refused",
+            "only the learner",
+        )
+    rejects(flying, LEARNER, m.SampleRequest(request=1), "refused", "only the learner")
+    rejects(flying, LEARNER, m.PolicyPush(version=1, updates=1, loss=0.0, model=b"x"), "refused", "only the learner")
 
 
 def test_a_policy_must_be_newer(learning: Learning) -> None:
     station = learning.station
-    station.handle(LEARNER, m.PolicyPush(3, 100, 0.5, b"three"), 1.0)
+    station.handle(LEARNER, m.PolicyPush(version=3, updates=100, loss=0.5, model=b"three"), 1.0)
     out = station.out.take()
-    assert out.sends == [(LEARNER, m.Ack(3))]
+    assert out.sends == [(LEARNER, m.Ack(version=3))]
     assert [(e.topic, e.values["version"], e.values["updates"]) for e in out.entries] == [("/learner/policy", 3, 100)]
-    rejects(station, LEARNER, m.PolicyPush(3, 200, 0.5, b"x"), "refused", "policy 3 is not newer than 3")
-    rejects(station, LEARNER, m.PolicyPush(2, 200, 0.5, b"x"), "refused", "policy 2 is not newer than 3")
+    rejects(
+        station,
+        LEARNER,
+        m.PolicyPush(version=3, updates=200, loss=0.5, model=b"x"),
+        "refused",
+        "policy 3 is not newer than 3",
+    )
+    rejects(
+        station,
+        LEARNER,
+        m.PolicyPush(version=2, updates=200, loss=0.5, model=b"x"),
+        "refused",
+        "policy 2 is not newer than 3",
+    )
 
 
 def test_the_policy_of_an_answer_can_be_had_as_long_as_it_may_be_asked_for(learning: Learning) -> None:
@@ -572,11 +631,11 @@ def test_the_policy_of_an_answer_can_be_had_as_long_as_it_may_be_asked_for(learn
     sends = learning.ship(0, 0)
     assert {x.policy for _, x in sends} == {1}  # type: ignore[attr-defined]
     for version in range(2, 40):
-        station.handle(LEARNER, m.PolicyPush(version, version, 0.0, b"%d" % version), 1.0)
+        station.handle(LEARNER, m.PolicyPush(version=version, updates=version, loss=0.0, model=b"%d" % version), 1.0)
     sent(station)
-    station.handle("uav-001", m.PolicyRequest(1), 1.0)
-    station.handle("uav-001", m.PolicyRequest(17), 1.0)
-    assert [x for _, x in sent(station)] == [m.Policy(1, b"one"), m.Policy(39, b"39")]
+    station.handle("uav-001", m.PolicyRequest(version=1), 1.0)
+    station.handle("uav-001", m.PolicyRequest(version=17), 1.0)
+    assert [x for _, x in sent(station)] == [m.Policy(version=1, model=b"one"), m.Policy(version=39, model=b"39")]
     assert len(station.policies) < 5
 
 
@@ -589,13 +648,15 @@ def test_a_learner_from_an_older_checkpoint_is_owed_what_it_lost(learning: Learn
     station = learning.station
     assert (station.rate_limiter.samples_due, station.rate_limiter.updates) == (0, 4)
     assert learning.ask(4, 5) == []
-    station.handle(LEARNER, m.Hello("learner", -1, 6, updates=1), 1.0)
+    station.handle(LEARNER, m.Hello(role="learner", uav=-1, incarnation=6, updates=1), 1.0)
     assert kinds(sent(station)) == [("learner", "Welcome")]
     assert (station.rate_limiter.samples_due, station.rate_limiter.updates) == (3, 1)
     again = learning.ask(1)
     batches = [x for to, x in first if to == LEARNER]
     assert frames(again[0][1]) == frames(batches[1])
-    station.handle(LEARNER, m.Hello("learner", -1, 6, updates=0), 1.0)  # a repeat takes nothing back
+    station.handle(
+        LEARNER, m.Hello(role="learner", uav=-1, incarnation=6, updates=0), 1.0
+    )  # a repeat takes nothing back
     assert station.rate_limiter.updates == 2
     sent(station)
 
@@ -635,7 +696,9 @@ def test_a_learner_that_comes_back_after_the_end_is_told(learning: Learning) -> 
     station = learning.station
     learning.ask(0, 1, 2)
     assert station.phase == "done"
-    station.handle(LEARNER, m.Hello("learner", -1, 77, updates=station.rate_limiter.updates - 2), 1.0)
+    station.handle(
+        LEARNER, m.Hello(role="learner", uav=-1, incarnation=77, updates=station.rate_limiter.updates - 2), 1.0
+    )
     sent(station)
     assert station.phase == "learning"
     sends = learning.ask(0, 1, 2)
@@ -648,7 +711,13 @@ def test_a_learner_that_did_not_hear_of_the_end_is_told_again(learning: Learning
     station = learning.station
     learning.ask(0, 1, 2)
     assert station.phase == "done"
-    station.handle(LEARNER, m.Hello("learner", -1, station.sample_queue.incarnation, station.rate_limiter.updates), 1.0)
+    station.handle(
+        LEARNER,
+        m.Hello(
+            role="learner", uav=-1, incarnation=station.sample_queue.incarnation, updates=station.rate_limiter.updates
+        ),
+        1.0,
+    )
     assert kinds(sent(station)) == [("learner", "Welcome"), ("learner", "End")]
 
 
@@ -712,7 +781,7 @@ def test_a_uav_comes_back_to_the_knowledge_that_it_had(mission: Callable[..., An
         if flown.pilots[0].t == 14:
             break
     track = [c for r in flown.records if r.uav == 0 for c in r.cells.tolist()]
-    flown.station.handle("uav-000", m.Hello("uav", 0, 99), 1.0)
+    flown.station.handle("uav-000", m.Hello(role="uav", uav=0, incarnation=99), 1.0)
     sends = sent(flown.station)
     assert kinds(sends) == [("uav-000", n) for n in ("Welcome", "Begin", "Map")]
     begin = sends[1][1]

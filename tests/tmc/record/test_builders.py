@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from tmc.record import builders, schemas
+from tmc.record import builders, overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.wire.messages import Record
 
@@ -32,7 +32,7 @@ def records(draw):
 @given(records())
 def test_flight_records_come_back_exactly(record):
     data = builders.flight_record(record).SerializeToString()
-    back = builders.to_record(schemas.FlightRecord.FromString(data))
+    back = builders.to_record(overfly_pb2.FlightRecord.FromString(data))
     for name, value in vars(record).items():
         other = getattr(back, name)
         if isinstance(value, np.ndarray):
@@ -44,7 +44,7 @@ def test_flight_records_come_back_exactly(record):
 @pytest.mark.parametrize("bad", [{"cells": [65_536]}, {"actions": [256]}, {"rewards": [float("nan")]}, {"episode": 0}])
 def test_a_flight_record_that_no_uav_may_send_is_refused(bad):
     with pytest.raises(RecordError, match="flight record of UAV 3 is not intact"):
-        builders.to_record(schemas.FlightRecord(**({"uav": 3, "episode": 1} | bad)))
+        builders.to_record(overfly_pb2.FlightRecord(**({"uav": 3, "episode": 1} | bad)))
 
 
 def test_grid_grows_to_the_north_and_comes_back():

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import compare, schemas
+from tmc.record import compare, overfly_pb2
 from tmc.record.channels import uav_topic
 from tmc.record.errors import RecordError
 from tmc.record.reader import read
@@ -23,30 +23,30 @@ def log_of_two(folder: Path) -> Path:
     """Two UAVs, ticks 0 to 4, T_u = 2: scenario-II maps and scenario-I events in one log, as no mission has them."""
     folder.mkdir()
     with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
-        log.write("/tmc/episode", schemas.Episode(episode=1, phase="begin", starts=[10, 20]))
+        log.write("/tmc/episode", overfly_pb2.Episode(episode=1, phase="begin", starts=[10, 20]))
         for first, tick in ((0, 0), (1, 2), (3, 4)):
             for uav in (0, 1):
                 log.write(uav_topic(uav, "record"), flown(uav, first, tick))
-            log.write("/tmc/sync", schemas.Sync(episode=1, tick=tick, version=tick + 1, uavs=[0, 1], believed=0.5))
+            log.write("/tmc/sync", overfly_pb2.Sync(episode=1, tick=tick, version=tick + 1, uavs=[0, 1], believed=0.5))
             log.write("/tmc/last_visit", grid(tick))
             ticks = range(first, tick + 1)
             values = {"uncertainty": [0.1 * t for t in ticks], "reward": [0.25 * t for t in ticks]}
-            log.write("/tmc/metrics", schemas.TeamMetrics(episode=1, first=first, steps=2 * tick, **values))
-        log.write("/tmc/events", schemas.Events(episode=1, ticks=[1, 1, 3], cells=[4, 9, 2]))
-        log.write("/tmc/episode", schemas.Episode(episode=1, phase="end", ticks=4, reward=[1.0, 2.0]))
+            log.write("/tmc/metrics", overfly_pb2.TeamMetrics(episode=1, first=first, steps=2 * tick, **values))
+        log.write("/tmc/events", overfly_pb2.Events(episode=1, ticks=[1, 1, 3], cells=[4, 9, 2]))
+        log.write("/tmc/episode", overfly_pb2.Episode(episode=1, phase="end", ticks=4, reward=[1.0, 2.0]))
     for uav in (0, 1):
         with LogWriter(folder / f"uav-00{uav}.mcap", f"uav-00{uav}", JournalConfig(), {}) as log:
             for first, tick in ((0, 0), (1, 2), (3, 4)):
                 hashes = [100 * uav + t for t in range(max(first, 1) - 1, tick)]
-                message = schemas.ObservationHashes(uav=uav, episode=1, first=first, tick=tick, hashes=hashes)
+                message = overfly_pb2.ObservationHashes(uav=uav, episode=1, first=first, tick=tick, hashes=hashes)
                 log.write(uav_topic(uav, "observation_hash"), message)
-            log.write(uav_topic(uav, "status"), schemas.UavStatus(uav=uav, waited=0.25 * uav))
+            log.write(uav_topic(uav, "status"), overfly_pb2.UavStatus(uav=uav, waited=0.25 * uav))
     return folder
 
 
 def flown(uav: int, first: int, tick: int) -> Any:
     ticks, moves = range(first, tick + 1), range(max(first, 1), tick + 1)
-    return schemas.FlightRecord(
+    return overfly_pb2.FlightRecord(
         uav=uav, incarnation=77, sequence=tick // 2, episode=1, first=first, tick=tick, version=max(tick - 1, 0),
         cells=[10 + 10 * uav + t for t in ticks], actions=[3 for _ in moves], blocks=[0 for _ in moves],
         rewards=[0.5 * t for t in moves], seen_tick=[t for t in ticks if t], seen_cell=[50 + t for t in ticks if t],
@@ -159,7 +159,7 @@ def test_what_the_schedule_changes_is_no_fact(original: Path, tmp_path: Path) ->
     def change(name: str, message: Any) -> Iterator[Any]:
         if name == "/tmc/metrics":
             for k, (uncertainty, reward) in enumerate(zip(message.uncertainty, message.reward, strict=True)):
-                yield schemas.TeamMetrics(
+                yield overfly_pb2.TeamMetrics(
                     episode=1, first=message.first + k, uncertainty=[uncertainty], reward=[reward]
                 )  # fmt: skip
             return

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import compact_run
 from tmc.record.mcap.recover import recover
@@ -25,10 +25,10 @@ from tmc.record.writer import LogWriter
 CHILD = """
 import sys, time
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.writer import LogWriter
 log = LogWriter(sys.argv[1], "tmc", JournalConfig(flush_interval=60), {}, resume=sys.argv[2] == "resume")
-log.write("/tmc/sync", schemas.Sync(tick=7))
+log.write("/tmc/sync", overfly_pb2.Sync(tick=7))
 log.flush()
 print("writing", flush=True)
 sys.stdin.read()
@@ -73,7 +73,7 @@ def test_a_second_writer_is_refused_while_the_first_lives(tmp_path: Path, how: s
                 refused()
         assert active.read_bytes() == whole and names(tmp_path) == ["tmc.mcap.active"]
     with LogWriter(path, "tmc", JournalConfig(), {}, resume=True) as log:  # a kill lets go of it
-        log.write("/tmc/sync", schemas.Sync(tick=8))
+        log.write("/tmc/sync", overfly_pb2.Sync(tick=8))
     assert [e.message.tick for e in read(path)] == [7, 8]
 
 
@@ -137,7 +137,7 @@ def another_user_may_enter(folder: Path) -> bool:
 
 def test_a_read_only_folder_is_said_and_keeps_its_logs(shared: Path) -> None:
     log = LogWriter(shared / "tmc.mcap", "tmc", JournalConfig(), {})
-    log.write("/tmc/sync", schemas.Sync(tick=1))
+    log.write("/tmc/sync", overfly_pb2.Sync(tick=1))
     log.flush()
     log._give_up()
     whole = log.active.read_bytes()
@@ -171,7 +171,7 @@ def test_a_disk_that_is_full(small_disk: Path) -> None:
     log = LogWriter(small_disk / "tmc.mcap", "tmc", JournalConfig(chunk=4096, flush_interval=60.0), {})
     with pytest.raises(RecordError, match="is full: free some space and resume; what was flushed stays readable"):
         for n in range(100_000):
-            log.write("/learner/policy", schemas.Policy(version=n, model=os.urandom(1000)))
+            log.write("/learner/policy", overfly_pb2.Policy(version=n, model=os.urandom(1000)))
     found = [e.message.version for e in read(log.active)]
     assert found == list(range(len(found))) and len(found) > 100
     whole = log.active.read_bytes()

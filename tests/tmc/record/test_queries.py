@@ -6,14 +6,14 @@ import struct
 import pytest
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import queries, schemas
+from tmc.record import overfly_pb2, queries
 from tmc.record.channels import uav_topic
 from tmc.record.errors import RecordError
 from tmc.record.writer import LogWriter
 
 
 def record(uav, sequence, episode, first, cells):
-    return schemas.FlightRecord(
+    return overfly_pb2.FlightRecord(
         uav=uav, sequence=sequence, episode=episode, first=first, tick=first + len(cells) - 1, cells=cells
     )
 
@@ -82,15 +82,15 @@ def test_an_active_log_has_facts_too(tmp_path):
 
 
 def test_uncertainty_events_and_episodes(tmp_path):
-    begin = schemas.Episode(episode=1, phase="begin", starts=[5, 9])
+    begin = overfly_pb2.Episode(episode=1, phase="begin", starts=[5, 9])
     others = [
         ("/tmc/episode", begin),
-        ("/tmc/events", schemas.Events(episode=1, ticks=[2, 1], cells=[4, 8])),
-        ("/tmc/events", schemas.Events(episode=1, ticks=[2], cells=[4])),
-        ("/tmc/metrics", schemas.TeamMetrics(episode=1, first=2, uncertainty=[2.0])),
-        ("/tmc/metrics", schemas.TeamMetrics(episode=1, first=0, uncertainty=[0.0, 1.0])),
-        ("/tmc/metrics", schemas.TeamMetrics(episode=1, first=1, uncertainty=[1.0, 2.0])),
-        ("/tmc/episode", schemas.Episode(episode=2, phase="begin")),
+        ("/tmc/events", overfly_pb2.Events(episode=1, ticks=[2, 1], cells=[4, 8])),
+        ("/tmc/events", overfly_pb2.Events(episode=1, ticks=[2], cells=[4])),
+        ("/tmc/metrics", overfly_pb2.TeamMetrics(episode=1, first=2, uncertainty=[2.0])),
+        ("/tmc/metrics", overfly_pb2.TeamMetrics(episode=1, first=0, uncertainty=[0.0, 1.0])),
+        ("/tmc/metrics", overfly_pb2.TeamMetrics(episode=1, first=1, uncertainty=[1.0, 2.0])),
+        ("/tmc/episode", overfly_pb2.Episode(episode=2, phase="begin")),
     ]
     folder = write(tmp_path / "run", FLOWN, others)
     assert list(queries.uncertainty(folder, 1)) == [(0, 0.0), (1, 1.0), (2, 2.0)]
@@ -101,7 +101,7 @@ def test_uncertainty_events_and_episodes(tmp_path):
 
 def test_a_missing_episode_is_named_with_those_that_are_there(tmp_path):
     flown = [record(0, n, e, 0, [1]) for n, e in enumerate((1, 2, 3, 7))]
-    folder = write(tmp_path / "run", flown, [("/tmc/metrics", schemas.TeamMetrics(episode=1))])
+    folder = write(tmp_path / "run", flown, [("/tmc/metrics", overfly_pb2.TeamMetrics(episode=1))])
     with pytest.raises(RecordError, match="holds nothing of episode 5: ask for one of 1 to 3, 7"):
         queries.moves(folder, 5)
     with pytest.raises(RecordError, match=r"episode 2: ask for one of 1$"):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import channels, schemas
+from tmc.record import channels, overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, info, read
 from tmc.record.run_folder import run_files
@@ -21,7 +21,7 @@ TICKS = 12
 def make(path, close=True):
     log = LogWriter(path, "tmc", JournalConfig(flush_interval=60.0), {"seed": "1"}, clock=lambda: 10**18)
     for tick in range(TICKS):
-        log.write("/tmc/sync", schemas.Sync(episode=1, tick=tick, uavs=[0, 1, 2], believed=tick / 3))
+        log.write("/tmc/sync", overfly_pb2.Sync(episode=1, tick=tick, uavs=[0, 1, 2], believed=tick / 3))
         if tick % 4 == 3:
             log.flush()
     log.attach("a", "text/plain", b"some text")
@@ -48,7 +48,7 @@ def facts(path, all_of_it=True):
     log = Log(path)
     ticks = []
     for e in log.entries():
-        assert e.message == schemas.Sync(episode=1, tick=e.sequence, uavs=[0, 1, 2], believed=e.sequence / 3)
+        assert e.message == overfly_pb2.Sync(episode=1, tick=e.sequence, uavs=[0, 1, 2], believed=e.sequence / 3)
         ticks.append(e.message.tick)
     if not all_of_it:
         return ticks, {}, [], log.damage
@@ -137,7 +137,7 @@ def test_a_chunk_that_went_missing_ends_the_reading(tmp_path):
     bounds = []
     for tick in range(3):
         bounds.append((tmp_path / "tmc.mcap.active").stat().st_size)
-        log.write("/tmc/sync", schemas.Sync(tick=tick))
+        log.write("/tmc/sync", overfly_pb2.Sync(tick=tick))
         log.flush()
     log._give_up()
     data = bytearray((tmp_path / "tmc.mcap.active").read_bytes())
@@ -151,7 +151,7 @@ def test_a_chunk_that_went_missing_ends_the_reading(tmp_path):
 
 def test_topics_are_chosen(tmp_path):
     with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
-        log.write("/tmc/sync", schemas.Sync(tick=1))
+        log.write("/tmc/sync", overfly_pb2.Sync(tick=1))
         log.log("info", "hello")
     assert [e.topic for e in read(tmp_path / "tmc.mcap", ["/log"])] == ["/log"]
     assert [e.topic for e in read(tmp_path / "tmc.mcap", [])] == []

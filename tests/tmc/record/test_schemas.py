@@ -1,42 +1,62 @@
-"""One truth in three places: the table of types, overfly.proto, and docs/reference/log-format.md agree."""
+"""overfly.proto, the classes generated from it, and docs/reference/log-format.md agree."""
 
+import importlib.util
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
-from google.protobuf import descriptor_pb2
+from google.protobuf import descriptor_pb2, descriptor_pool
 
-import tmc.record
-from tmc.record import channels, schemas
+from tmc.record import channels, overfly_pb2, schemas
 from tmc.record.errors import RecordError
 
-PROTO = Path(tmc.record.__file__).with_name("overfly.proto")
-DOC = Path(tmc.record.__file__).parents[2] / "docs" / "reference" / "log-format.md"
+ROOT = Path(__file__).parents[3]
+DOC = ROOT / "docs" / "reference" / "log-format.md"
+_SPEC = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+hatch_build = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(hatch_build)
 
 
-def parse(text):
-    """A FileDescriptorProto of the few forms that overfly.proto uses; anything else fails."""
-    text = re.sub(r"//[^\n]*", "", text)
-    syntax, package = re.search(r'syntax = "(\w+)";', text)[1], re.search(r"package (\w+);", text)[1]
-    file = descriptor_pb2.FileDescriptorProto(name="overfly.proto", package=package, syntax=syntax)
-    rest = re.sub(r'syntax = "\w+";|package \w+;', "", text)
-    for name, body in re.findall(r"message (\w+) \{([^}]*)\}", rest):
-        message = file.message_type.add(name=name)
-        for line in filter(None, map(str.strip, body.split("\n"))):
-            repeated, kind, field, number = re.fullmatch(r"(repeated )?(\w+) (\w+) = (\d+);", line).groups()
-            proto = descriptor_pb2.FieldDescriptorProto
-            message.field.add(
-                name=field,
-                number=int(number),
-                type=proto.Type.Value(f"TYPE_{kind.upper()}"),
-                label=proto.LABEL_REPEATED if repeated else proto.LABEL_OPTIONAL,
-            )
-    assert not re.sub(r"message (\w+) \{([^}]*)\}", "", rest).strip()
-    return file
+def fields_of(message):
+    """The fields of a type as the document shows them; their numbers are their places."""
+    assert [field.number for field in message.field] == [*range(1, len(message.field) + 1)]
+    kinds = descriptor_pb2.FieldDescriptorProto
+    return ", ".join(
+        f"{kinds.Type.Name(field.type).removeprefix('TYPE_').lower()}{'*' * (field.label == kinds.LABEL_REPEATED)} "
+        f"{field.name}"
+        for field in message.field
+    )
 
 
-def test_the_proto_file_and_the_code_agree():
-    assert parse(PROTO.read_text()) == schemas.file_descriptor()
+def test_the_classes_are_generated_from_the_proto_file(tmp_path):
+    """A change of the .proto file in a checkout is in the classes only after `make proto`."""
+    for name in map(Path, hatch_build.PROTOS):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    for path in hatch_build.generate(tmp_path):
+        assert (ROOT / path).read_bytes() == (tmp_path / path).read_bytes(), f"{path} is out of date: run make proto"
+
+
+def test_the_generated_code_runs_with_the_oldest_protobuf_that_is_allowed():
+    """Generated code refuses a runtime that is older than its protoc: 5.29.6 is protoc 29.6."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    oldest = next(d for d in project["project"]["dependencies"] if d.startswith("protobuf>=")).partition(">=5.")[2]
+    protoc = f"{hatch_build.PROTOC}=={oldest}"
+    assert (
+        protoc in project["build-system"]["requires"] and protoc in project["project"]["optional-dependencies"]["dev"]
+    )
+    assert protoc in (ROOT / "constraints.txt").read_text().split()
+
+
+def test_a_users_types_of_the_same_names_do_not_collide():
+    """Protobuf's pool is one for the whole process: there our file goes by its path, our types by their package."""
+    file = descriptor_pb2.FileDescriptorProto(name="overfly.proto", package="mine", syntax="proto3")
+    file.message_type.add(name="Sync")
+    pool = descriptor_pool.Default()
+    pool.AddSerializedFile(file.SerializeToString())
+    assert pool.FindMessageTypeByName("overfly.Sync") is overfly_pb2.Sync.DESCRIPTOR
+    assert pool.FindMessageTypeByName("mine.Sync").file.name == "overfly.proto"
 
 
 def test_every_schema_of_the_table_describes_itself():
@@ -46,7 +66,7 @@ def test_every_schema_of_the_table_describes_itself():
         assert files.file[-1].package == package
         assert name in [m.name for m in files.file[-1].message_type]
     used = {c.schema for c in (*channels.CHANNELS, *channels.REPLAY_CHANNELS)}
-    assert {f"overfly.{name}" for name in schemas.TYPES} <= used
+    assert {f"overfly.{name}" for name in overfly_pb2.DESCRIPTOR.message_types_by_name} <= used
 
 
 @pytest.mark.parametrize("name", ["overfly.Nothing", "foxglove.Nothing", "foxglove.os.path", "ros.Grid"])
@@ -71,7 +91,9 @@ def test_the_document_shows_the_table_of_topics_of_replay_files():
 
 
 def test_the_document_shows_the_types():
-    assert dict(rows(DOC.read_text(), "Types")) == schemas.TYPES
+    file = descriptor_pb2.FileDescriptorProto()
+    overfly_pb2.DESCRIPTOR.CopyToProto(file)
+    assert rows(DOC.read_text(), "Types") == [(message.name, fields_of(message)) for message in file.message_type]
 
 
 def test_the_example_of_the_document_runs(tmp_path, monkeypatch, capsys):
@@ -79,7 +101,7 @@ def test_the_example_of_the_document_runs(tmp_path, monkeypatch, capsys):
     from tmc.record.writer import LogWriter  # noqa: PLC0415
 
     with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
-        log.write("/tmc/metrics", schemas.TeamMetrics(episode=7, first=0, uncertainty=[1.5, 2.5]))
+        log.write("/tmc/metrics", overfly_pb2.TeamMetrics(episode=7, first=0, uncertainty=[1.5, 2.5]))
     code, _with_pandas = re.findall(r"```python\n(.*?)```", DOC.read_text(), re.S)
     monkeypatch.chdir(tmp_path)
     exec(code, {})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import builders, schemas
+from tmc.record import builders, overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, read
 from tmc.record.run_folder import run_files
@@ -29,20 +29,20 @@ def names(folder):
 
 
 def sync(tick):
-    return schemas.Sync(episode=1, tick=tick, version=2, policy=3, uavs=[0, 1], believed=0.25)
+    return overfly_pb2.Sync(episode=1, tick=tick, version=2, policy=3, uavs=[0, 1], believed=0.25)
 
 
 def messages():
     """One message for every topic that the TMC writes."""
     return {
-        "/uav/3/record": schemas.FlightRecord(uav=3, cells=[1, 2]),
+        "/uav/3/record": overfly_pb2.FlightRecord(uav=3, cells=[1, 2]),
         "/tmc/sync": sync(1),
-        "/tmc/episode": schemas.Episode(episode=1, phase="begin", starts=[4, 5]),
-        "/tmc/events": schemas.Events(episode=1, ticks=[1], cells=[2]),
-        "/tmc/metrics": schemas.TeamMetrics(episode=1, uncertainty=[0.5], reward=[0.0]),
+        "/tmc/episode": overfly_pb2.Episode(episode=1, phase="begin", starts=[4, 5]),
+        "/tmc/events": overfly_pb2.Events(episode=1, ticks=[1], cells=[2]),
+        "/tmc/metrics": overfly_pb2.TeamMetrics(episode=1, uncertainty=[0.5], reward=[0.0]),
         "/tmc/last_visit": builders.grid(np.arange(6), 2, 3, 60.0, 1),
         "/map/roads": builders.geojson("{}"),
-        "/learner/policy": schemas.Policy(version=1, model=b"x"),
+        "/learner/policy": overfly_pb2.Policy(version=1, model=b"x"),
         "/log": builders.log_message("info", "hello", "tmc", 1),
     }
 
@@ -103,11 +103,11 @@ def test_wrong_topics_and_messages_are_refused_and_change_nothing(tmp_path):
         with pytest.raises(RecordError, match="no topic /tmc/sink: add it to the table"):
             log.write("/tmc/sink", sync(0))
         with pytest.raises(RecordError, match="no topic /uav/03/record"):
-            log.write("/uav/03/record", schemas.FlightRecord())
+            log.write("/uav/03/record", overfly_pb2.FlightRecord())
         with pytest.raises(RecordError, match=r"is written by learner, not by tmc"):
-            log.write("/learner/metrics", schemas.LearnerMetrics())
+            log.write("/learner/metrics", overfly_pb2.LearnerMetrics())
         with pytest.raises(RecordError, match=r"/tmc/sync holds overfly.Sync, not overfly.Policy"):
-            log.write("/tmc/sync", schemas.Policy())
+            log.write("/tmc/sync", overfly_pb2.Policy())
         with pytest.raises(RecordError, match="publish time -1 does not fit"):
             log.write("/tmc/sync", sync(0), publish_time=-1)
         log.write("/tmc/sync", sync(0))
@@ -137,7 +137,7 @@ def test_a_full_disk_stops_the_log_and_keeps_what_was_flushed(tmp_path):
     code = f"""
 import resource, signal
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.writer import LogWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -146,13 +146,13 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 done = 0
 try:
     while True:
-        log.write("/tmc/sync", schemas.Sync(tick=done))
+        log.write("/tmc/sync", overfly_pb2.Sync(tick=done))
         log.flush()
         done += 1
 except RecordError as error:
     first = str(error)
 log.close()
-for call in (log.flush, lambda: log.write("/tmc/sync", schemas.Sync())):
+for call in (log.flush, lambda: log.write("/tmc/sync", overfly_pb2.Sync())):
     try:
         call()
         raise SystemExit("went on")
@@ -192,11 +192,11 @@ def test_flush_is_due_after_the_configured_time(tmp_path):
 CHILD = """
 import sys
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.writer import LogWriter
 log = LogWriter(sys.argv[1], "tmc", JournalConfig(flush_interval=60), {})
 for tick in range(10**9):
-    log.write("/tmc/sync", schemas.Sync(tick=tick, uavs=range(tick % 7)))
+    log.write("/tmc/sync", overfly_pb2.Sync(tick=tick, uavs=range(tick % 7)))
     if tick % 50 == 49:
         log.flush()
         print(tick + 1, flush=True)

@@ -100,7 +100,7 @@ def test_a_message_that_breaks_its_rule_all_the_same_ends_a_process_with_a_sente
     import tmc.__main__ as center  # noqa: PLC0415
 
     def push() -> int:
-        m.Bye("uav", 0, "x" * 1025)
+        m.Bye(role="uav", uav=0, reason="x" * 1025)
         return 0
 
     for process_of in (uav, learner, center):

@@ -19,10 +19,19 @@ from tmc.wire.messages import EMPTY, MESSAGES, PROTOCOL, Error, Map, Message, Mi
 QUICK = settings(max_examples=60, deadline=None)
 Same = Callable[[Message, Message], bool]
 BATCH = Minibatch(
-    1, 0, 0, np.zeros(4, "<u2"), np.zeros((4, 1), "<u2"), np.zeros((4, 5), "<f4"),
-    np.zeros(2, "u1"), np.zeros(2, "<f4"), np.zeros(2, "<f4"), np.ones((2, 9), "u1"), np.arange(2),
-    np.ones(2, "<f4"),
-)  # fmt: skip
+    request=1,
+    episodes=0,
+    ticks=0,
+    cells=np.zeros(4, "<u2"),
+    peers=np.zeros((4, 1), "<u2"),
+    u=np.zeros((4, 5), "<f4"),
+    action=np.zeros(2, "u1"),
+    reward=np.zeros(2, "<f4"),
+    discount=np.zeros(2, "<f4"),
+    allowed=np.ones((2, 9), "u1"),
+    index=np.arange(2),
+    weight=np.ones(2, "<f4"),
+)
 ANYTHING = st.recursive(
     st.none()
     | st.booleans()
@@ -56,7 +65,7 @@ def refused(frames: list[Any]) -> CodecError:
     """The error; its code and text must make a reply that can be sent, whatever was in the frames."""
     with pytest.raises(CodecError) as caught:
         decode(frames)
-    decode(encode(Error(caught.value.code, str(caught.value))))
+    decode(encode(Error(code=caught.value.code, text=str(caught.value))))
     return caught.value
 
 
@@ -65,7 +74,7 @@ def survives(frames: list[Any], same: Same) -> None:
     try:
         message = decode(frames)
     except CodecError as error:
-        decode(encode(Error(error.code, str(error))))
+        decode(encode(Error(code=error.code, text=str(error))))
         return
     assert type(message) in MESSAGES
     assert same(decode(as_bytes(message)), message)
@@ -105,11 +114,17 @@ def test_mutated_frames(any_message: st.SearchStrategy[Message], same: Same, dat
         frame = frames[which]
         a, b = sorted(data.draw(st.tuples(*[st.integers(0, len(frame))] * 2)))
         frames[which] = data.draw(
-            st.sampled_from([
-                frame[:a] + frame[b:], frame[:b] + frame[a:], frame[:a] + data.draw(st.binary(max_size=6)) + frame[a:],
-                frame[:a], frame[a:], bytes(reversed(frame)),
-            ])
-        )  # fmt: skip
+            st.sampled_from(
+                [
+                    frame[:a] + frame[b:],
+                    frame[:b] + frame[a:],
+                    frame[:a] + data.draw(st.binary(max_size=6)) + frame[a:],
+                    frame[:a],
+                    frame[a:],
+                    bytes(reversed(frame)),
+                ]
+            )
+        )
         other = data.draw(st.integers(0, len(frames) - 1))
         if data.draw(st.booleans()):
             frames[which], frames[other] = frames[other], frames[which]
@@ -137,11 +152,26 @@ def test_what_is_no_map_is_malformed(frames: list[bytes]) -> None:
 
 @pytest.mark.parametrize("tail", [b"\x00", b"\x80", b"\xc1"])
 def test_bytes_after_the_map_are_malformed(tail: bytes) -> None:
-    assert refused([as_bytes(PolicyRequest(1))[0] + tail]).code == "malformed"
+    assert refused([as_bytes(PolicyRequest(version=1))[0] + tail]).code == "malformed"
 
 
 def test_every_cut_header_is_malformed() -> None:
-    whole = as_bytes(Status("flying", 1, 2, 3, 4, 5, 0.5, 1.0, 1.0, 0, 0, "uav-001"))[0]
+    whole = as_bytes(
+        Status(
+            phase="flying",
+            episode=1,
+            tick=2,
+            ticks=3,
+            updates=4,
+            policy=5,
+            loss=0.5,
+            uncertainty=1.0,
+            episode_uncertainty=1.0,
+            blocked=0,
+            rejected=0,
+            waiting="uav-001",
+        )
+    )[0]
     assert {refused([whole[:n]]).code for n in range(len(whole))} == {"malformed"}
 
 
@@ -239,17 +269,41 @@ def test_an_int_is_an_int_in_range(value: Any, code: str) -> None:
      (None, "malformed"), (1e31, "range")],
 )  # fmt: skip
 def test_a_float_is_finite(value: Any, code: str) -> None:
-    status = Status("flying", 1, 2, 3, 4, 5, 0.5, 1.0, 1.0, 0, 0, "")
+    status = Status(
+        phase="flying",
+        episode=1,
+        tick=2,
+        ticks=3,
+        updates=4,
+        policy=5,
+        loss=0.5,
+        uncertainty=1.0,
+        episode_uncertainty=1.0,
+        blocked=0,
+        rejected=0,
+        waiting="",
+    )
     assert refused(with_header(status, loss=value)).code == code
 
 
 @pytest.mark.parametrize("value", [None, 7, "ab", [1, 2], b"abc", {"a": 1}, True])
 def test_an_array_is_bytes_of_whole_entries(value: Any) -> None:
-    assert refused(with_header(Map(1, 2, 3, 4, 5, 5, EMPTY, EMPTY), last_visit=value)).code == "malformed"
+    assert (
+        refused(
+            with_header(
+                Map(episode=1, tick=2, version=3, policy=4, sequence=5, acknowledged=5, last_visit=EMPTY, active=EMPTY),
+                last_visit=value,
+            )
+        ).code
+        == "malformed"
+    )
 
 
 def test_an_array_longer_than_its_rule_is_out_of_range() -> None:
-    frames = with_header(Map(1, 2, 3, 4, 5, 5, EMPTY, EMPTY), last_visit=bytes(2 * 65_536))
+    frames = with_header(
+        Map(episode=1, tick=2, version=3, policy=4, sequence=5, acknowledged=5, last_visit=EMPTY, active=EMPTY),
+        last_visit=bytes(2 * 65_536),
+    )
     assert refused(frames).code == "range"
 
 
@@ -267,13 +321,13 @@ def test_each_field_of_a_minibatch_must_be_there(name: str) -> None:
 
 
 def test_unknown_fields_are_refused() -> None:
-    assert refused(with_header(PolicyRequest(1), colour="red")).code == "malformed"
+    assert refused(with_header(PolicyRequest(version=1), colour="red")).code == "malformed"
 
 
 @pytest.mark.parametrize("value", [None, 1, [1], "onnx", b""])
 def test_a_header_entry_for_a_frame_of_its_own_is_refused(value: Any) -> None:
     """A blob stands in its frame only; an entry of the same name in the header is one too many."""
-    assert refused(with_header(Policy(1, b"onnx"), model=value)).code == "malformed"
+    assert refused(with_header(Policy(version=1, model=b"onnx"), model=value)).code == "malformed"
 
 
 # Frames
@@ -284,7 +338,7 @@ def test_missing_and_extra_frames_are_refused() -> None:
     for n in range(1, len(frames)):
         assert refused(frames[:n]).code == "malformed"
     assert refused([*frames, b""]).code == "malformed"
-    assert refused([*as_bytes(PolicyRequest(1)), b"x"]).code == "malformed"
+    assert refused([*as_bytes(PolicyRequest(version=1)), b"x"]).code == "malformed"
 
 
 @pytest.mark.parametrize(
@@ -336,5 +390,5 @@ def test_arrays_that_lie_otherwise_in_memory_arrive_in_order() -> None:
 
 
 def test_a_frame_names_its_type_and_version() -> None:
-    values = msgpack.unpackb(as_bytes(PolicyRequest(7))[0])
+    values = msgpack.unpackb(as_bytes(PolicyRequest(version=7))[0])
     assert values == {"type": "PolicyRequest", "v": PROTOCOL, "version": 7}

@@ -148,7 +148,7 @@ def test_a_message_to_a_name() -> None:
 
 def meets(context: zmq.Context[Any], bound: str, connected: str) -> bool:
     server, client = sockets.router(context, bound), sockets.dealer(context, connected, "uav-000")
-    sockets.send(client, PolicyRequest(1))
+    sockets.send(client, PolicyRequest(version=1))
     came = bool(server.poll(10_000))
     server.close()
     client.close()

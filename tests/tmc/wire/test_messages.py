@@ -31,46 +31,119 @@ def numbers(dtype: str, *values: float) -> NDArray[Any]:
 
 MAPS = np.arange(4 * 5, dtype="<f4").reshape(4, 5)
 EXAMPLES: tuple[Message, ...] = (
-    m.Hello("uav", 2, 12345),
-    m.Hello("learner", -1, 2**63 - 1, updates=7),
-    m.Welcome('{"team.size": 3}', "ab" * 32, "run-1", "/tmp/tracks", 4),
+    m.Hello(role="uav", uav=2, incarnation=12345),
+    m.Hello(role="learner", uav=-1, incarnation=2**63 - 1, updates=7),
+    m.Welcome(config='{"team.size": 3}', map="ab" * 32, run="run-1", tracks="/tmp/tracks", policy=4),
     m.Begin(
-        episode=1, tick=1, shipped=-1, sequence=0, version=0, policy=1,
-        last_visit=numbers("<u2", 0, 1), track=numbers("<u2", 17, 18), lost=EMPTY,
+        episode=1,
+        tick=1,
+        shipped=-1,
+        sequence=0,
+        version=0,
+        policy=1,
+        last_visit=numbers("<u2", 0, 1),
+        track=numbers("<u2", 17, 18),
+        lost=EMPTY,
     ),
     m.Record(
-        2, 12345, 3, 1, 1, 2, 5, 4, numbers("<u2", 7, 8), numbers("u1", 3, 8), numbers("u1", 0, 1),
-        numbers("<f4", 1.5, -20), numbers("<u2", 2), numbers("<u2", 9),
+        uav=2,
+        incarnation=12345,
+        sequence=3,
+        episode=1,
+        first=1,
+        tick=2,
+        version=5,
+        policy=4,
+        cells=numbers("<u2", 7, 8),
+        actions=numbers("u1", 3, 8),
+        blocks=numbers("u1", 0, 1),
+        rewards=numbers("<f4", 1.5, -20),
+        seen_tick=numbers("<u2", 2),
+        seen_cell=numbers("<u2", 9),
     ),
     m.Record(
-        2, 12345, 4, 1, 3, 3, 5, 4, numbers("<u2", 7), numbers("u1", 8), numbers("u1", 0), numbers("<f4", 1.5),
-        EMPTY, EMPTY, values=numbers("<f4", 0.25, 2.5),
+        uav=2,
+        incarnation=12345,
+        sequence=4,
+        episode=1,
+        first=3,
+        tick=3,
+        version=5,
+        policy=4,
+        cells=numbers("<u2", 7),
+        actions=numbers("u1", 8),
+        blocks=numbers("u1", 0),
+        rewards=numbers("<f4", 1.5),
+        seen_tick=EMPTY,
+        seen_cell=EMPTY,
+        values=numbers("<f4", 0.25, 2.5),
     ),
-    m.Map(1, 10, 5, 4, 3, 2, numbers("<u2", 0, 10, 3), EMPTY),
-    m.Alive(1, 12345, 40, -1, 7),
-    m.Lost(2, 1, 30),
-    m.PolicyRequest(4),
-    m.Policy(4, b"\x08\x01onnx\x00"),
-    m.SampleRequest(9),
-    m.SampleRequest(10, numbers("<i8", 3, 2**40), numbers("<f4", 0.5, 7)),
+    m.Map(
+        episode=1,
+        tick=10,
+        version=5,
+        policy=4,
+        sequence=3,
+        acknowledged=2,
+        last_visit=numbers("<u2", 0, 10, 3),
+        active=EMPTY,
+    ),
+    m.Alive(uav=1, incarnation=12345, tick=40, peer=-1, sequence=7),
+    m.Lost(episode=2, uav=1, tick=30),
+    m.PolicyRequest(version=4),
+    m.Policy(version=4, model=b"\x08\x01onnx\x00"),
+    m.SampleRequest(request=9),
+    m.SampleRequest(request=10, index=numbers("<i8", 3, 2**40), errors=numbers("<f4", 0.5, 7)),
     m.Minibatch(
-        9, 0, 100, numbers("<u2", 4, 5, 6, 7), np.arange(8, dtype="<u2").reshape(4, 2), MAPS, numbers("u1", 1, 8),
-        numbers("<f4", 1, 2), numbers("<f4", 0.9, 0.9), np.ones((2, 9), "u1"), numbers("<i8", 0, 2**40),
+        request=9,
+        episodes=0,
+        ticks=100,
+        cells=numbers("<u2", 4, 5, 6, 7),
+        peers=np.arange(8, dtype="<u2").reshape(4, 2),
+        u=MAPS,
+        action=numbers("u1", 1, 8),
+        reward=numbers("<f4", 1, 2),
+        discount=numbers("<f4", 0.9, 0.9),
+        allowed=np.ones((2, 9), "u1"),
+        index=numbers("<i8", 0, 2**40),
     ),
     m.Minibatch(
-        9, 0, 100, numbers("<u2", 4, 6), np.zeros((2, 0), "<u2"), MAPS[:2], numbers("u1", 1), numbers("<f4", 1),
-        numbers("<f4", 0.9), np.ones((1, 9), "u1"), numbers("<i8", 2**40), weight=numbers("<f4", 0.5),
+        request=9,
+        episodes=0,
+        ticks=100,
+        cells=numbers("<u2", 4, 6),
+        peers=np.zeros((2, 0), "<u2"),
+        u=MAPS[:2],
+        action=numbers("u1", 1),
+        reward=numbers("<f4", 1),
+        discount=numbers("<f4", 0.9),
+        allowed=np.ones((1, 9), "u1"),
+        index=numbers("<i8", 2**40),
+        weight=numbers("<f4", 0.5),
     ),
-    m.PolicyPush(5, 100, 0.25, b"onnx"),
-    m.Ack(5),
-    m.Beacon(0, 1, 3, numbers("<u2", 4, 5), numbers("<u2", 1, 2)),
-    m.Beacon(0, 1, 3, EMPTY, EMPTY, ask=3),
+    m.PolicyPush(version=5, updates=100, loss=0.25, model=b"onnx"),
+    m.Ack(version=5),
+    m.Beacon(uav=0, episode=1, tick=3, cells=numbers("<u2", 4, 5), to=numbers("<u2", 1, 2)),
+    m.Beacon(uav=0, episode=1, tick=3, cells=EMPTY, to=EMPTY, ask=3),
     m.StatusRequest(),
-    m.Status("flying", 1, 10, 30, 5, 2, 0.5, 12.25, 13.0, 1, 0, "uav-001"),
-    m.End("the mission is over"),
-    m.Bye("uav", 2, "SIGTERM"),
-    m.Error("range", "Record.tick is out of range"),
-)  # fmt: skip
+    m.Status(
+        phase="flying",
+        episode=1,
+        tick=10,
+        ticks=30,
+        updates=5,
+        policy=2,
+        loss=0.5,
+        uncertainty=12.25,
+        episode_uncertainty=13.0,
+        blocked=1,
+        rejected=0,
+        waiting="uav-001",
+    ),
+    m.End(reason="the mission is over"),
+    m.Bye(role="uav", uav=2, reason="SIGTERM"),
+    m.Error(code="range", text="Record.tick is out of range"),
+)
 
 
 def every_field(*kinds: str) -> list[Any]:
@@ -116,8 +189,10 @@ def test_frames_decode_in_the_process_that_made_them(message: Message, same: Sam
 def test_an_empty_minibatch_decodes_in_the_process_that_made_it(same: Same) -> None:
     """Python cannot cast a view of an empty array with several dimensions."""
     cells, peers, none = numbers("<u2"), np.zeros((0, 2), "<u2"), numbers("<f4")
-    rest = (none, none, np.ones((0, 9), "u1"), np.zeros(0, "<i8"))
-    empty = m.Minibatch(9, 0, 100, cells, peers, MAPS[:0], numbers("u1"), *rest)
+    rest = {"reward": none, "discount": none, "allowed": np.ones((0, 9), "u1"), "index": np.zeros(0, "<i8")}
+    empty = m.Minibatch(
+        request=9, episodes=0, ticks=100, cells=cells, peers=peers, u=MAPS[:0], action=numbers("u1"), **rest
+    )
     assert same(decode([bytes(frame) for frame in encode(empty)]), empty)
     assert same(decode(encode(empty)), empty)
 
@@ -231,4 +306,4 @@ def test_the_longest_frame_of_a_field_fits_the_sockets(cls: type[Message], name:
 
 def test_codes_of_field_errors_are_codes_of_the_error_reply() -> None:
     for code in ("malformed", "range"):
-        assert m.Error(code, "x").code == code
+        assert m.Error(code=code, text="x").code == code

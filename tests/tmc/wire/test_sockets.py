@@ -90,18 +90,20 @@ def wait_message(sock: Sock) -> Message:
 
 def meet(bound: Sock, client: Sock, name: bytes) -> None:
     """One round trip, after which both sides know each other."""
-    assert sockets.send(client, PolicyRequest(7))
+    assert sockets.send(client, PolicyRequest(version=7))
     identity, *frames = wait(bound)
-    assert (identity, decode(frames)) == (name, PolicyRequest(7))
-    assert sockets.send(bound, Ack(7), to=name)
-    assert wait_message(client) == Ack(7)
+    assert (identity, decode(frames)) == (name, PolicyRequest(version=7))
+    assert sockets.send(bound, Ack(version=7), to=name)
+    assert wait_message(client) == Ack(version=7)
 
 
 def batch(b: int) -> Minibatch:
     maps = np.random.default_rng(1).random((2 * b, 2700)).astype("<f4")
     cells, ones = np.zeros(2 * b, "<u2"), np.ones(b, "<f4")
-    rest = (ones, ones, np.ones((b, 9), "u1"), np.arange(b))
-    return Minibatch(1, 2, 3, cells, cells[:, None], maps, np.ones(b, "u1"), *rest)
+    rest = {"reward": ones, "discount": ones, "allowed": np.ones((b, 9), "u1"), "index": np.arange(b)}
+    return Minibatch(
+        request=1, episodes=2, ticks=3, cells=cells, peers=cells[:, None], u=maps, action=np.ones(b, "u1"), **rest
+    )
 
 
 # Round trips
@@ -110,7 +112,7 @@ def batch(b: int) -> Minibatch:
 def test_round_trip(radio: Radio, endpoint: str, same: Same) -> None:
     """A named client's word, and an answer of a megabyte to that name."""
     bound, client = radio.router(endpoint), radio.dealer(endpoint, "uav-002")
-    hello, answer = Hello("uav", 2, 99), batch(64)
+    hello, answer = Hello(role="uav", uav=2, incarnation=99), batch(64)
     assert sockets.send(client, hello)
     identity, *frames = wait(bound)
     assert identity == b"uav-002"
@@ -134,13 +136,13 @@ def test_every_client_gets_its_own_answer(radio: Radio, endpoint: str) -> None:
     bound = radio.router(endpoint)
     clients = [radio.dealer(endpoint, f"uav-{i:03d}") for i in range(5)]
     for i, client in enumerate(clients):
-        assert sockets.send(client, PolicyRequest(i))
+        assert sockets.send(client, PolicyRequest(version=i))
     for _ in clients:
         identity, *frames = wait(bound)
         request = decode(frames)
         assert isinstance(request, PolicyRequest)
-        assert sockets.send(bound, Ack(request.version), to=identity)
-    assert [wait_message(client) for client in clients] == [Ack(i) for i in range(5)]
+        assert sockets.send(bound, Ack(version=request.version), to=identity)
+    assert [wait_message(client) for client in clients] == [Ack(version=i) for i in range(5)]
 
 
 def test_nothing_there_is_none(radio: Radio, endpoint: str) -> None:
@@ -151,8 +153,8 @@ def test_nothing_there_is_none(radio: Radio, endpoint: str) -> None:
 
 def test_a_client_may_come_before_the_tmc(radio: Radio, endpoint: str) -> None:
     client = radio.dealer(endpoint, "uav-000")
-    assert sockets.send(client, PolicyRequest(1))
-    assert decode(wait(radio.router(endpoint))[1:]) == PolicyRequest(1)
+    assert sockets.send(client, PolicyRequest(version=1))
+    assert decode(wait(radio.router(endpoint))[1:]) == PolicyRequest(version=1)
 
 
 def test_a_client_finds_the_tmc_again(radio: Radio, endpoint: str) -> None:
@@ -170,7 +172,7 @@ def test_a_client_finds_the_tmc_again(radio: Radio, endpoint: str) -> None:
             time.sleep(0.01)
     while not again.poll(100):  # a request in flight may be lost, so ask again, as the services do
         assert time.monotonic() < deadline
-        sockets.send(client, PolicyRequest(1))
+        sockets.send(client, PolicyRequest(version=1))
     assert wait(again)[0] == b"uav-000"
 
 
@@ -179,8 +181,8 @@ def test_a_new_process_takes_over_its_name(radio: Radio, endpoint: str) -> None:
     meet(bound, old, b"uav-001")
     new = radio.dealer(endpoint, "uav-001")
     meet(bound, new, b"uav-001")
-    assert sockets.send(bound, Ack(2), to=b"uav-001")
-    assert wait_message(new) == Ack(2)
+    assert sockets.send(bound, Ack(version=2), to=b"uav-001")
+    assert wait_message(new) == Ack(version=2)
     assert not old.poll(50)
 
 
@@ -189,7 +191,7 @@ def test_a_new_process_takes_over_its_name(radio: Radio, endpoint: str) -> None:
 
 def test_a_message_to_no_client_is_not_sent(radio: Radio, endpoint: str) -> None:
     bound = radio.router(endpoint)
-    assert sockets.send(bound, Ack(1), to=b"uav-009") is False
+    assert sockets.send(bound, Ack(version=1), to=b"uav-009") is False
     client = radio.dealer(endpoint, "uav-009")
     meet(bound, client, b"uav-009")
 
@@ -197,20 +199,20 @@ def test_a_message_to_no_client_is_not_sent(radio: Radio, endpoint: str) -> None
 def test_a_full_queue_does_not_block(radio: Radio, ipc: str) -> None:
     """A client whose TMC never came: at some point the answer is False, at once."""
     client = radio.dealer(ipc, "uav-000")
-    assert not all(sockets.send(client, PolicyRequest(i)) for i in range(5000))
+    assert not all(sockets.send(client, PolicyRequest(version=i)) for i in range(5000))
 
 
 def test_nothing_is_sent_on_a_closed_socket(radio: Radio, ipc: str) -> None:
     client = radio.dealer(ipc, "uav-000")
     client.close()
-    assert sockets.send(client, PolicyRequest(1)) is False
+    assert sockets.send(client, PolicyRequest(version=1)) is False
 
 
 def test_unsent_messages_do_not_keep_a_process() -> None:
     """No linger: the default waits for ever at exit for a TMC that never comes, and this test would not end."""
     with zmq.Context() as context:
         client = sockets.dealer(context, f"tcp://127.0.0.1:{sockets.free_port()}", "uav-000")
-        assert sockets.send(client, PolicyRequest(1))
+        assert sockets.send(client, PolicyRequest(version=1))
         client.close()
 
 
@@ -245,7 +247,13 @@ def test_an_oversize_part_from_the_other_side_does_not_reach_a_client(radio: Rad
 def test_frames_that_are_no_message_do_not_break_the_socket(radio: Radio, ipc: str) -> None:
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
-    for junk in ([b""], [b"\xc1"], [b"x"] * (sockets.MAX_FRAMES + 1), [*encode(Ack(1)), b"more"], [b"\x80"] * 100):
+    for junk in (
+        [b""],
+        [b"\xc1"],
+        [b"x"] * (sockets.MAX_FRAMES + 1),
+        [*encode(Ack(version=1)), b"more"],
+        [b"\x80"] * 100,
+    ):
         bound.send_multipart([b"uav-000", *junk])
         assert client.poll(PATIENCE_MS)
         with pytest.raises(CodecError):
@@ -256,7 +264,7 @@ def test_frames_that_are_no_message_do_not_break_the_socket(radio: Radio, ipc: s
 def test_too_many_frames_are_counted_before_they_are_read(radio: Radio, ipc: str) -> None:
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
-    bound.send_multipart([b"uav-000", *encode(Ack(1)), *[b"x"] * sockets.MAX_FRAMES])
+    bound.send_multipart([b"uav-000", *encode(Ack(version=1)), *[b"x"] * sockets.MAX_FRAMES])
     assert client.poll(PATIENCE_MS)
     with pytest.raises(CodecError, match=rf"{sockets.MAX_FRAMES + 1} frames, at most {sockets.MAX_FRAMES}"):
         sockets.receive_message(client)
@@ -270,10 +278,10 @@ def test_a_flood_and_a_hang_up_leave_the_tmc_standing(radio: Radio, endpoint: st
         for _ in range(900):
             evil.send(b"x" * 100, zmq.NOBLOCK)
         assert bound.poll(PATIENCE_MS)
-    assert sockets.send(client, PolicyRequest(8))
+    assert sockets.send(client, PolicyRequest(version=8))
     while (frames := wait(bound))[0] == b"evil":  # as much of the flood as has come
         pass
-    assert (frames[0], decode(frames[1:])) == (b"uav-000", PolicyRequest(8))
+    assert (frames[0], decode(frames[1:])) == (b"uav-000", PolicyRequest(version=8))
     assert bound.getsockopt(zmq.HEARTBEAT_IVL) == 0
 
 

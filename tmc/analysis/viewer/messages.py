@@ -7,10 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tmc.record.builders import FRAME
-from tmc.record.schemas import foxglove, message_class
+from tmc.record.schemas import foxglove
+
+if TYPE_CHECKING:  # importing each takes milliseconds: see schemas.foxglove
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 WORLD = "world"
 """The parent of the grid's frame; both have the same origin."""
@@ -26,38 +32,38 @@ HEIGHT_CELLS = 0.5
 Point = tuple[float, float]
 
 
-def pose_in_frame(at: Point, yaw: float, time_ns: int) -> Any:
+def pose_in_frame(at: Point, yaw: float, time_ns: int) -> PoseInFrame:
     """Return a foxglove.PoseInFrame. `yaw`: radians, from east to north."""
-    message = message_class("foxglove.PoseInFrame")(frame_id=FRAME)
+    message: PoseInFrame = foxglove("PoseInFrame").PoseInFrame(frame_id=FRAME)
     message.timestamp.FromNanoseconds(time_ns)
     _place(message.pose, at, 0.0, yaw)
     return message
 
 
-def world_to_map(time_ns: int) -> Any:
+def world_to_map(time_ns: int) -> FrameTransform:
     """Return the foxglove.FrameTransform that viewers need once: the identity."""
-    message = message_class("foxglove.FrameTransform")(parent_frame_id=WORLD, child_frame_id=FRAME)
+    message: FrameTransform = foxglove("FrameTransform").FrameTransform(parent_frame_id=WORLD, child_frame_id=FRAME)
     message.timestamp.FromNanoseconds(time_ns)
     message.translation.x = message.translation.y = message.translation.z = 0.0
     message.rotation.w = 1.0
     return message
 
 
-def scene(entities: Iterable[Any], gone: Iterable[str], time_ns: int) -> Any:
+def scene(entities: Iterable[SceneEntity], gone: Iterable[str], time_ns: int) -> SceneUpdate:
     """Return a foxglove.SceneUpdate that replaces `entities` and deletes those with an id in `gone`."""
-    message = message_class("foxglove.SceneUpdate")(entities=entities)
+    message: SceneUpdate = foxglove("SceneUpdate").SceneUpdate(entities=entities)
     matching = foxglove("SceneEntityDeletion").SceneEntityDeletion.MATCHING_ID
     for name in gone:
         message.deletions.add(type=matching, id=name).timestamp.FromNanoseconds(time_ns)
     return message
 
 
-def uav_entity(uav: int, trail: Sequence[Point], colour: str, shape: int, cell_m: float, time_ns: int) -> Any:
+def uav_entity(uav: int, trail: Sequence[Point], colour: str, shape: int, cell_m: float, time_ns: int) -> SceneEntity:
     """Return a foxglove.SceneEntity `uav-<id>`: a body at the last point of the trail, its number, and the trail.
 
     `trail`: points, metres. `colour`: `#RRGGBB`. `shape`: index in SHAPES, modulo its length.
     """
-    entity = message_class("foxglove.SceneEntity")(frame_id=FRAME, id=entity_id(uav))
+    entity: SceneEntity = foxglove("SceneEntity").SceneEntity(frame_id=FRAME, id=entity_id(uav))
     entity.timestamp.FromNanoseconds(time_ns)
     entity.lifetime.FromNanoseconds(0)  # until it is replaced or deleted
     z = HEIGHT_CELLS * cell_m / (1 + uav / 100)

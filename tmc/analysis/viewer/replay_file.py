@@ -24,7 +24,7 @@ from tmc.analysis.viewer.timeline import Timeline, read_timeline
 from tmc.kernel.grid import ACTIONS
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
-from tmc.record import builders, schemas
+from tmc.record import builders, overfly_pb2
 from tmc.record.channels import FORMAT, uav_topic
 from tmc.record.disk import write_atomically
 from tmc.record.errors import RecordError
@@ -114,7 +114,7 @@ def _grid(world: World, now: Maps, row: int) -> Any:
 
 def _team_tick(timeline: Timeline, now: Maps) -> Any:
     t, cells, sums = now.tick, timeline.world.law.cells.size, now.sums
-    return schemas.TeamTick(
+    return overfly_pb2.TeamTick(
         episode=timeline.episode, tick=t, uncertainty=sums[TRUE], uncertainty_per_cell=sums[TRUE] / cells,
         believed=sums[TMC], believed_per_cell=sums[TMC] / cells, reward=timeline.reward[t],
         blocked=int((timeline.blocks[t] > 0).sum()), answered=len(timeline.answered.get(t, [])),
@@ -131,7 +131,7 @@ def _uav(timeline: Timeline, now: Maps, uav: int) -> Messages:
     if lonlat is not None:
         yield uav_topic(uav, "fix"), builders.location_fix(*lonlat, t * TICK_NS)
     believed = float(now.sums[UAV + uav])
-    yield uav_topic(uav, "tick"), schemas.UavTick(
+    yield uav_topic(uav, "tick"), overfly_pb2.UavTick(
         uav=uav, episode=timeline.episode, tick=t, cell=cell, action=int(timeline.actions[t, uav]),
         block=int(timeline.blocks[t, uav]), reward=float(timeline.rewards[t, uav]), believed=believed,
         believed_per_cell=believed / timeline.world.law.cells.size, exchanged=now.exchanged[uav],

@@ -9,7 +9,9 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
+
+from google.protobuf.message import Message
 
 from tmc.record import disk, schemas
 from tmc.record.channels import ACTIVE, CHANNELS, role
@@ -46,7 +48,7 @@ class Export:
         with self._guard():
             self._writer.start(profile=PROFILE)
 
-    def write(self, topic: str, message: Any, time_ns: int) -> None:
+    def write(self, topic: str, message: Message, time_ns: int) -> None:
         """Write a protobuf message. Both its times are `time_ns`; it gets the topic's next number, from 0."""
         name = message.DESCRIPTOR.full_name
         number = self._sequences.get(topic, 0)

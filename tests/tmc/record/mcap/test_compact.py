@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.mcap.compact import CHUNK_BYTES, compact_run
 from tmc.record.reader import Log
@@ -26,7 +26,7 @@ def fill(folder: Path, process: str, rounds: int, *, close: bool = True) -> Path
     log.attach("config.json", "application/json", b"{}")
     for n in range(rounds):
         if process == "tmc":
-            log.write("/tmc/sync", schemas.Sync(tick=n, uavs=range(9), believed=n / 7), publish_time=5 + n)
+            log.write("/tmc/sync", overfly_pb2.Sync(tick=n, uavs=range(9), believed=n / 7), publish_time=5 + n)
         log.log("info", f"round {n}")
         log.flush()
     if close:
@@ -74,7 +74,7 @@ def test_all_is_kept_and_takes_less(run: Path) -> None:
 def test_large_logs_get_chunks_of_four_mebibytes(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
         for n in range(5):
-            log.write("/learner/policy", schemas.Policy(version=n, model=bytes(2_000_000)))
+            log.write("/learner/policy", overfly_pb2.Policy(version=n, model=bytes(2_000_000)))
     compact_run(tmp_path)
     with (tmp_path / "tmc.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()

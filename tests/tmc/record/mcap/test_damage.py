@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from tmc.kernel.config import JournalConfig
-from tmc.record import schemas
+from tmc.record import overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.mcap.recover import recover, recovered_name
 from tmc.record.reader import Log
@@ -44,7 +44,7 @@ def make(folder: Path, *, close: bool) -> Whole:
         begin = log.active.stat().st_size
         log.log("info", f"round {n}")
         for tick in range(5):
-            log.write("/tmc/sync", schemas.Sync(episode=1, tick=5 * n + tick, uavs=range(tick), believed=n / 3))
+            log.write("/tmc/sync", overfly_pb2.Sync(episode=1, tick=5 * n + tick, uavs=range(tick), believed=n / 3))
         log.flush()
         chunks.append((begin, log.active.stat().st_size, written, written + 6))
         written += 6
@@ -325,7 +325,7 @@ def test_a_recovered_log_is_resumed_with_its_gap(wholes: dict[bool, Whole], tmp_
     data[whole.chunks[4][0] + 60] ^= 1
     recover(write(tmp_path, whole, bytes(data)), in_place=True)
     with LogWriter(tmp_path / "tmc.mcap", "tmc", JournalConfig(), {}, resume=True) as log:
-        log.write("/tmc/sync", schemas.Sync(tick=99))
+        log.write("/tmc/sync", overfly_pb2.Sync(tick=99))
     again = Log(tmp_path / "tmc.mcap")
     assert len(list(again.raw())) == len(whole.messages) - 6 + 1
     assert again.damage is None and "bytes from byte" in again.lost["lost"]
