@@ -4,7 +4,7 @@
 >>> run = overfly.fly("planner:greedy", out="demo", lockstep=True, actors=2, ticks=20, quiet=True)
 >>> run.moves(1).shape  # a cell for each tick, 0 to 20, and UAV
 (21, 2)
->>> print(overfly.open_run("demo").summary.mission.who)
+>>> print(overfly.open_run("demo").summary.mission.controller)
 planner:greedy
 
 The command `overfly` is built on this module. Importing it loads nothing heavy: NumPy, ONNX Runtime, ZeroMQ and torch

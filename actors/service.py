@@ -146,8 +146,8 @@ class Service:
             network = PolicyController(model, config, observer)
             return hasher.watch(network) if hasher else network
 
-        who = config.team.controller
-        planner: Controller | None = PlannerController(world, who) if who.startswith(PREFIX) else None
+        name = config.team.controller
+        planner: Controller | None = PlannerController(world, name) if name.startswith(PREFIX) else None
         planner = hasher.watch(planner) if hasher and planner else planner
         return Pilot(world, self.uav, self.incarnation, tracks, observer, controller, planner, time.time_ns), radio
 

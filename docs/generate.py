@@ -127,18 +127,14 @@ def command_page() -> str:
 # The settings.
 
 
-def kind(setting: Setting) -> str:
-    """The type of a setting, in a word or as the values that it may have."""
+def allowed(setting: Setting) -> str:
+    """The values that a setting may have, with their unit."""
+    kinds = {str: "text", tuple: "list of int"}
     if get_origin(setting.type) is Literal:
-        return ", ".join(f"`{value}`" for value in get_args(setting.type))
-    if get_origin(setting.type) is tuple:
-        return "list of int"
-    return str(getattr(setting.type, "__name__", setting.type))
-
-
-def bounds(setting: Setting) -> str:
-    """The range of a number, with its unit."""
-    return cell(f"{setting.allowed} {setting.unit}".strip()) if setting.low is not None else ""
+        values = ", ".join(f"`{choice}`" for choice in get_args(setting.type))
+    else:
+        values = setting.allowed or kinds.get(get_origin(setting.type) or setting.type, "")
+    return cell(" ".join(filter(None, [values, setting.unit])))
 
 
 def value(shown: Any) -> str:
@@ -165,10 +161,10 @@ def settings_page() -> str:
     parts = [
         "# Settings\n",
         prose(
-            "Every setting has a dotted name, a default, a range, a unit and a source. `--set replay.capacity=50000` "
-            "changes one, and a list is written with commas: `--set network.channels=16,32`. The defaults are the "
-            "paper's; where it leaves a point open, the source says so. `overfly doctor --settings --preset NAME` "
-            "prints them as a preset has them."
+            "Every setting has a dotted name, a default, a range with its unit, and a source. `--set "
+            "replay.capacity=50000` changes one, and a list is written with commas: `--set "
+            "network.channels=16,32`. The defaults are the paper's; where it leaves a point open, the source says "
+            "so. `overfly doctor --settings --preset NAME` prints them as a preset has them."
         ),
         "Some settings have an option of their own:\n",
         "| option | setting |\n| --- | --- |",
@@ -179,12 +175,11 @@ def settings_page() -> str:
         groups.setdefault(setting.key.rpartition(".")[0], []).append(setting)
     for group, members in groups.items():
         parts.append(f"## {GROUPS.get(group, group)}\n")
-        parts.append(
-            "| setting | default | range and unit, or values | what | source |\n| --- | --- | --- | --- | --- |"
-        )
+        if members[0].trial:
+            parts.append("`overfly verify` sets these; an ordinary mission has none of them.\n")
+        parts.append("| setting | default | values | what | source |\n| --- | --- | --- | --- | --- |")
         rows = (
-            f"| `{s.key}` | {value(s.default)} | {bounds(s) or kind(s)} | {cell(s.about)} | {linked(s.source)} |"
-            for s in members
+            f"| `{s.key}` | {value(s.default)} | {allowed(s)} | {cell(s.about)} | {linked(s.source)} |" for s in members
         )
         parts.append("\n".join(rows) + "\n")
     parts += presets()

@@ -24,7 +24,7 @@ settings.register_profile("explore", derandomize=False, **PATIENT)
 settings.load_profile("overfly")
 
 for name in ("COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "PYTHONWARNINGS"):
-    os.environ.pop(name, None)  # what the user's terminal and other programs are to do is no setting of the tests
+    os.environ.pop(name, None)  # what the user's terminal and other programs are to do must not reach the tests
 
 # A suite that a script runs in the background has INT ignored, and so would the commands that it starts; nohup: HUP.
 signal.pthread_sigmask(signal.SIG_SETMASK, [])

@@ -61,7 +61,7 @@ def examples(document: str) -> list[str]:
 
 @pytest.mark.slow
 def test_the_first_example_of_the_document(place: Path) -> None:
-    code = examples("docs/python.md")[0]
+    code = examples("docs/guides/python.md")[0]
     assert len([line for line in code.splitlines() if line]) <= 12
     done = python(code, place)
     assert done.returncode == 0, done.stderr
@@ -71,7 +71,7 @@ def test_the_first_example_of_the_document(place: Path) -> None:
 
 
 def test_the_other_examples_of_the_document(place: Path) -> None:
-    for code in examples("docs/python.md")[1:]:
+    for code in examples("docs/guides/python.md")[1:]:
         done = python(code, place)
         assert done.returncode == 0, done.stderr
 

@@ -67,7 +67,7 @@ def take_up(station: Station, journal: Journal) -> None:
     start = time.monotonic()
     missing = recover(station, journal.writer.active, start)
     for member in station.roster:
-        member.heard = time.monotonic()  # nobody could be heard while the journal was played
+        member.heard = time.monotonic()  # no client could be heard while the journal was played
     journal.take(Outbox(entries=missing))
     journal.commit()
     seconds, episode = time.monotonic() - start, station.episode

@@ -33,7 +33,7 @@ TEXTBOOK = f"x textbook calls/s, aim {MIN_SHARE:g}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument("--repeats", type=int, default=5, metavar="R", help="episodes to take medians of (default: 5)")
     settings.add_options(parser)
 

@@ -51,7 +51,7 @@ class Run:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument(
         "--dir", type=Path, default=Path(), help="folder on the disk to measure (default: the current one)"
     )

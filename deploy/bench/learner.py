@@ -67,7 +67,7 @@ class Learned:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument("--repeats", type=int, default=3, metavar="R", help="turns to take medians of (default: 3)")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="length of each stretch (default: 10)")
     parser.add_argument(

@@ -27,7 +27,7 @@ MB_PER_MIB = 1024**2 / 1e6
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument("--transitions", type=int, default=6000, metavar="T",
                         help="transitions in the replay memory at the measurement (default: 6000)")  # fmt: skip
     settings.add_options(parser)

@@ -49,7 +49,7 @@ WARM_UP_MINIBATCHES = 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument("--minibatches", type=int, default=500, metavar="M", help="minibatches to time (default: 500)")
     settings.add_options(parser)
 

@@ -74,7 +74,7 @@ class RunData:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument(
         "--who", default="planner:greedy", help="policy file, run folder or planner (default: %(default)s)"
     )

@@ -47,7 +47,7 @@ POLL_S = 0.05
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument("--repeats", type=int, default=5, metavar="R", help="turns to take medians of (default: 5)")
     parser.add_argument("--warm", type=int, default=1, metavar="W", help="warm-up turns that do not count (default: 1)")
     settings.add_options(parser)

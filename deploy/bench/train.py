@@ -19,7 +19,7 @@ from deploy.run.mission import check
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the bench."""
+    """Add the options of the bench."""
     parser.add_argument("--actors", default="3,10", metavar="N[,N...]", help="default: %(default)s")
     parser.add_argument("--repeats", type=int, default=3, metavar="R", help="turns to take medians of (default: 3)")
     parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="length of each stretch (default: 10)")

@@ -49,7 +49,7 @@ BENCHES: tuple[Bench, ...] = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the command."""
+    """Add the options of the command."""
     names = parser.add_subparsers(dest="bench", required=True, metavar="NAME")
     for bench in BENCHES:
         sub = names.add_parser(bench.name, help=bench.about, description=bench.about)

@@ -208,7 +208,7 @@ def text(rows: Sequence[Row], config: Config) -> str:
     """The table for a person."""
     scenario, ticks = config.scenario, config.training.ticks
     lines = [
-        f"Mean uncertainty a road cell: {ticks:,} ticks, scenario {scenario}, T_u = {config.T_u}, "
+        f"Mean uncertainty per road cell: {ticks:,} ticks, scenario {scenario}, T_u = {config.T_u}, "
         f"{printable(config.world.map)};",
         f"mean of {rows[0].seeds} seeds with its 95 % interval. x bound: against a lower bound that no team can beat.",
         "blocked: moves refused in a mission; collisions: those of them that another UAV stood in the way of.",

@@ -85,7 +85,7 @@ class ForkServer:
             self._refuse(name, log, f"the system has no room for another process ({error.strerror}): raise ulimit -u")
             return
         if pid == 0:
-            run_child(self._package, self._main, server, self._ends, argv, log)
+            run_forked(self._package, self._main, server, self._ends, argv, log)
         self._pids[name], self._names[pid] = pid, name
         _send_report({"name": name, "pid": pid})
 
@@ -112,7 +112,7 @@ def _send_report(report: dict[str, Any]) -> None:
         data = data[os.write(1, data) :]
 
 
-def run_child(package: str, main: Main, server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
+def run_forked(package: str, main: Main, server: int, ends: tuple[int, int], argv: list[str], log: str) -> NoReturn:
     """Run `main(argv)` in a forked process that has nothing of the server but its memory; never returns."""
     code = process.FAILED
     try:

@@ -132,7 +132,7 @@ def interrupted(out: Path, say: Callable[[str], None] = process.tell) -> tuple[W
     journal = RunFolder(out).existing_journal()
     assert journal is not None
     with disk.open_locked(journal, "rb"):
-        log = Log(journal)  # nobody writes it
+        log = Log(journal)  # no process writes it
     if log.damage and not log.still_open:
         text = f"{log.damage}: the run goes on from before that; the damaged file is kept as {journal.name}.damaged-*"
         say(f"{text}, and `overfly log recover` says what else is in it")

@@ -16,7 +16,7 @@ from typing import IO
 from actors.tracks import create_table, table_bytes
 from tmc.kernel.config import Config, ConfigError
 from tmc.kernel.text import printable
-from tmc.wire.endpoints import FEED, LONGEST_PATH
+from tmc.wire.endpoints import LEARNER_SUFFIX, MAX_PATH_BYTES
 
 NAME, HELD = "overfly-", "held"
 """Prefix of the folders' names, and the file in each that is locked while its supervisor runs."""
@@ -109,11 +109,11 @@ def _made(place: Path, table: tuple[int, int] | None) -> Scratch:
 
 
 def _try_socket(scratch: Scratch) -> None:
-    path = f"{scratch.folder}/sync{FEED}"
+    path = f"{scratch.folder}/sync{LEARNER_SUFFIX}"
     if not path.isprintable():
         raise OSError(0, "its path holds a character that a socket's may not")
-    if len(os.fsencode(path)) > LONGEST_PATH:
-        most = LONGEST_PATH - len(os.fsencode(path)) + len(os.fsencode(scratch.folder.parent))
+    if len(os.fsencode(path)) > MAX_PATH_BYTES:
+        most = MAX_PATH_BYTES - len(os.fsencode(path)) + len(os.fsencode(scratch.folder.parent))
         raise OSError(0, f"its path is longer than {most} bytes, too long for sockets in it")
     with socket.socket(socket.AF_UNIX) as probe:
         probe.bind(path)

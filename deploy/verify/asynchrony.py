@@ -90,8 +90,8 @@ class Result:
         if self.difference is not None:
             return f"DIFFERENT: {self.difference}"
         if not self.lead.allowed:
-            return "LEAD NOT ALLOWED"
-        return "as in lock step" if self.passed else "LEAD TOO SMALL"
+            return "TOO FAR AHEAD"
+        return "as in lock step" if self.passed else "NOT FAR AHEAD"
 
     def row(self) -> str:
         """Return a line of the table."""

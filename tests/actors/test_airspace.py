@@ -160,8 +160,8 @@ def fly(flyers: list[Flyer], rng: Random, air: Callable[[], bool], silence: Call
             stuck.add(flyer.i)
 
 
-def nobody() -> None:
-    pytest.fail("everybody waits for somebody")
+def no_delivery() -> None:
+    pytest.fail("all UAVs wait for another one")
 
 
 @settings(max_examples=40, deadline=None)
@@ -169,7 +169,7 @@ def nobody() -> None:
 def test_over_a_table(plan: Plan, seed: int) -> None:
     trace, table = Trace(), TrackTable(plan.team, TICKS)
     flyers = [Flyer(plan, i, TableTracks(table, i), trace) for i in range(plan.team)]
-    fly(flyers, Random(seed), lambda: False, nobody)
+    fly(flyers, Random(seed), lambda: False, no_delivery)
     assert trace == reference(plan)
 
 
@@ -210,7 +210,7 @@ class Air:
 def test_over_radio_a_uav_that_waits_gets_a_beacon(plan: Plan, seed: int) -> None:
     """Beacons arrive late but in order, so no UAV ever has to request a track."""
     air = Air(plan, Random(seed), lost=0.0)
-    fly(air.flyers, air.rng, air.deliver, nobody)
+    fly(air.flyers, air.rng, air.deliver, no_delivery)
     assert air.trace == reference(plan)
 
 
@@ -234,7 +234,7 @@ def test_two_that_fly_towards_each_other_over_radio() -> None:
     while first.step():
         pass
     assert first.t == 19  # 39 - 2 * 19 = 1: only here can the other be next to it
-    fly([first, second], air.rng, air.deliver, nobody)
+    fly([first, second], air.rng, air.deliver, no_delivery)
     assert air.trace == reference(plan)
 
 

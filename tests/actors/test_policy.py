@@ -205,7 +205,7 @@ def test_a_model_without_a_description_is_refused(world: World, text: str | None
 
 
 def test_a_model_with_other_names_is_refused(world: World) -> None:
-    """Somebody else's network under our description."""
+    """A foreign network under our description."""
     model = onnx.load_from_string(policy(world.config, world.grid))
     for node in model.graph.node:
         node.output[:] = ["other" if name == "q" else name for name in node.output]

@@ -104,7 +104,7 @@ def test_the_installed_module_flies(installed: Path, tmp_path: Path) -> None:
 
 
 def test_mypy_sees_the_types_of_the_module(installed: Path, tmp_path: Path) -> None:
-    """When it is told to, as docs/python.md says: a single module has no place for py.typed."""
+    """When it is told to, as docs/guides/python.md says: a single module has no place for py.typed."""
     (tmp_path / "user.py").write_text("import overfly\nreveal_type(overfly.fly('x').moves(1))\noverfly.tarin()\n")
     (tmp_path / "mypy.ini").write_text("[mypy]\nstrict = true\n[mypy-overfly]\nfollow_untyped_imports = true\n")
     result = subprocess.run(

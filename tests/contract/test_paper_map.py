@@ -46,7 +46,7 @@ def test_every_place_exists(page: str) -> None:
         if not (ROOT / path).exists() or (name and name not in names(path)):
             missing.append(whole)
         elif separator == "::" and not (path.startswith("tests/") and name.startswith("test_")):
-            missing.append(f"{whole} is no test")
+            missing.append(f"{whole} is not a test")
     assert not missing
 
 

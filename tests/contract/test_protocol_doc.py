@@ -110,9 +110,9 @@ def test_the_codes_of_errors() -> None:
 def test_the_limits() -> None:
     limits = {row[0]: row[1] for row in rows(section("Frames"))}
     assert limits == {
-        "first frame": f"{codec.HEADER_LIMIT:,} bytes",
-        "any frame": f"{sockets.PART_LIMIT:,} bytes",
-        "frames per message": f"{sockets.PARTS}",
+        "first frame": f"{codec.HEADER_LIMIT_BYTES:,} bytes",
+        "any frame": f"{sockets.FRAME_LIMIT_BYTES:,} bytes",
+        "frames per message": f"{sockets.MAX_FRAMES}",
     }
 
 

@@ -41,6 +41,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fake:
 def hide(fake: Fake, *modules: str) -> None:
     """Hide these modules from processes, as if they were not installed."""
     fake("sitecustomize.py", f"""
+import shlex
 import sys
 class Hidden:
     def find_spec(self, name, path=None, target=None):
@@ -85,7 +86,9 @@ def test_what_needs_a_learner_says_what_is_missing(
     done = here(*command, cwd=place)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     listed = "torch (not installed), onnx (not installed) and safetensors (not installed)"
-    assert done.stderr.startswith(f"overfly: a learner needs {listed}: run {sys.executable} -m pip install ")
+    assert done.stderr.startswith(
+        f"overfly: a learner needs {listed}: run {shlex.quote(sys.executable)} -m pip install "
+    )
     assert list(place.iterdir()) == []
 
 

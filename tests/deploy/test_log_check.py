@@ -35,7 +35,7 @@ def damage(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_check_prints_a_line_an_invariant(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_a_line_per_invariant(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["log", "check", str(run)]) == 0
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
@@ -43,7 +43,8 @@ def test_check_prints_a_line_an_invariant(run: Path, capsys: pytest.CaptureFixtu
     assert len(lines) == 25 and all(re.search(r" [\d,]+  (ok|-)$", line) for line in lines[1:23])
     said = lines[24].removeprefix(f"{run}/tmc.mcap: ")
     assert re.fullmatch(r"1 episode, [\d,]+ facts, all invariants hold in \d+\.\d s", said)
-    assert printed.err == ""
+    progress = r"checked episode 1: \d+%"  # on a machine so slow that the check takes seconds
+    assert all(re.fullmatch(progress, line) for line in printed.err.splitlines())
 
 
 def test_check_of_damage_is_exit_code_1(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,7 +54,7 @@ def test_check_of_damage_is_exit_code_1(run: Path, capsys: pytest.CaptureFixture
     assert re.search(r"^file .* VIOLATED: tmc\.mcap: .*, at byte \d+$", out, re.MULTILINE)
 
 
-def test_cat_of_damage_prints_what_is_sound_and_says_that_it_is_not_all(
+def test_cat_of_damage_prints_what_is_intact_and_says_that_it_is_incomplete(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     damage(run / "tmc.mcap")
@@ -79,7 +80,7 @@ def test_recover_of_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_recover_of_a_file(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, out = run / "tmc.mcap", tmp_path / "mended.mcap"
+    path, out = run / "tmc.mcap", tmp_path / "recovered.mcap"
     path.write_bytes(path.read_bytes()[:-2000])
     assert main(["log", "recover", str(path), "--out", str(out)]) in (0, log_check.LOSS)
     assert Log(out).finished

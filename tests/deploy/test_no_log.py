@@ -30,7 +30,7 @@ NO_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a socket": (a_socket, "is a socket): give the file of a log"),
     "a loop of links": (lambda path: path.symlink_to(path), "cannot be read (Too many levels of symbolic links)"),
     "empty": (Path.touch, "is empty: "),
-    "text": (lambda path: path.write_text("hello, world, this is no log"), "MCAP file"),
+    "text": (lambda path: path.write_text("hello, world, this is not a log"), "MCAP file"),
     "a folder without logs": (Path.mkdir, "holds no logs of a run (tmc.mcap and others)"),
     "a folder with a pipe": (lambda path: (path.mkdir(), os.mkfifo(path / "tmc.mcap")), "holds no logs of a run"),
 }

@@ -74,8 +74,8 @@ def heard(tmc: zmq.Socket[Any], count: int) -> list[str]:
 
 
 def test_however_often_a_tmc_is_away_the_same_number_of_requests_is_in_flight(tmp_path: Path, short: Path) -> None:
-    """A restarted TMC receives several Hellos and answers each with Welcome."""
-    tmc = sockets.router(context := zmq.Context(), f"ipc://{short}/sync.feed")
+    """It finds several hellos when it is back, and welcomes each."""
+    tmc = sockets.router(context := zmq.Context(), f"ipc://{short}/sync.learner")
     service = Service(f"ipc://{short}/sync", tmp_path / "R")
     config = build({"network.channels": (2, 2), "network.dense": 2})
     welcome = m.Welcome(json.dumps(flat(config)), World(config).map.fingerprint, "run", "", 0, 0)

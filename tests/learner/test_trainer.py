@@ -63,7 +63,7 @@ def test_updates_are_plain_adam_on_the_plain_equations(preset, trainer_of, minib
         found = reference.gradient(trainer.online).double()
         assert ((found - exact).abs() <= bound).all()
         adam.step(found)
-    # Each step rounds the weight, and some ten numbers that are no larger than the step.
+    # Each step rounds the weight, and some ten numbers that are at most as large as the step.
     torch.testing.assert_close(weights(trainer.online).double(), adam.theta, atol=40 * eps * adam.lr, rtol=4 * eps)
     assert not torch.allclose(weights(trainer.online), weights(trainer.target), atol=1e-4)
 

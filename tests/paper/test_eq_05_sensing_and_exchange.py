@@ -1,4 +1,4 @@
-"""Sec. II-C: who is in sensing range, and when a UAV and the TMC exchange what."""
+"""Sec. II-C: which UAVs are in sensing range, and when a UAV and the TMC exchange what."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Fly = Callable[..., Any]
 
 @pytest.mark.parametrize("radius", [1.0, 1.5, 2.9])
 def test_eq_05_neighbours_are_the_uavs_within_r_s(radius: float, fly: Fly) -> None:
-    """N_i(t) = {i' != i: |p_i(t) - p_i'(t)| <= r_s}, and nobody else's location is known."""
+    """N_i(t) = {i' != i: |p_i(t) - p_i'(t)| <= r_s}, and no other location is known."""
     flown = fly({"team.size": 8, "team.sensing_range": radius})
     cols, met = flown.world.grid.cols, 0
     for (episode, uav, t), state in flown.sights.items():

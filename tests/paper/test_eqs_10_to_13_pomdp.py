@@ -92,11 +92,11 @@ def test_eq_13_visiting_uncertain_cells_pays_what_it_takes_from_eq_06(fly: Fly) 
     """The accounting identity, end to end: with every true u before a visit, eq. (6) of the flight follows."""
     flown = fly({"comms.period": 10})
     world, q, T = flown.world, np.exp(-0.01), 37
-    nobody = world.law.cells.size * sum(1 - q**t for t in range(1, T + 1))
+    unvisited = world.law.cells.size * sum(1 - q**t for t in range(1, T + 1))
     for episode, cells in flown.cells.items():
         tau, taken = np.zeros(world.grid.size), 0.0
         for t in range(1, T + 1):
             for k in cells[t][world.map.road[cells[t]]].tolist():
                 taken += (1 - q ** (t - tau[k])) * (1 - q ** (T - t + 1)) / (1 - q)
                 tau[k] = t
-        assert sum(flown.series("uncertainty", episode)[1:]) == pytest.approx(nobody - taken, abs=1e-9)
+        assert sum(flown.series("uncertainty", episode)[1:]) == pytest.approx(unvisited - taken, abs=1e-9)

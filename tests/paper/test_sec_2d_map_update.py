@@ -36,14 +36,14 @@ def test_sec_2d_local_and_global_update(period: int, initial: str, fly: Fly) -> 
     world, team = flown.world, range(6)
     for episode, cells in flown.cells.items():
         tau = np.zeros((6, world.grid.size), np.uint16)
-        everyone, s = np.zeros(world.grid.size, np.uint16), world.initial_factor(episode)
+        all_visits, s = np.zeros(world.grid.size, np.uint16), world.initial_factor(episode)
         for t in range(37):
-            everyone[cells[t]] = t
+            all_visits[cells[t]] = t
             for i in team:
                 near = [j for j in team if world.grid.within(cells[t, i], cells[t, j], 1.5)]
                 tau[i, cells[t, near]] = t
                 if t % period == 0:
-                    tau[i] = np.maximum(tau[i], everyone)
+                    tau[i] = np.maximum(tau[i], all_visits)
                 expected = world.law.values(tau[i, world.law.cells], t, s)
                 assert flown.sights[episode, i, t].u.tolist() == expected.tolist()
 

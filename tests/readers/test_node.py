@@ -72,11 +72,11 @@ def write(path: Path, messages: Iterable[tuple[int, bytes]]) -> None:
         writer.finish()
 
 
-SOUND = schemas.Sync(tick=7).SerializeToString()
+INTACT = schemas.Sync(tick=7).SerializeToString()
 WRONG = {
-    "ends within a field": ([(1, SOUND), (2, SOUND[:-1])], "index out of range"),
+    "ends within a field": ([(1, INTACT), (2, INTACT[:-1])], "index out of range"),
     "field that the schema has not": ([(1, b"\x78\x01")], "not what its schema describes"),
-    "times that go back": ([(5, SOUND), (4, SOUND)], "log time 4 comes after 5"),
+    "times that go back": ([(5, INTACT), (4, INTACT)], "log time 4 comes after 5"),
 }
 
 

@@ -44,5 +44,5 @@ def test_a_uav_killed_at_up_to_ten_random_ticks_flies_the_same(
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert 0 < kills - 1 <= errors.count("uav-001 was killed by SIGKILL; it is started again") <= kills
-    assert here(*mission, "--lockstep", "--out", tmp_path / "undisturbed").returncode == 0
-    assert digest(out) == digest(tmp_path / "undisturbed")
+    assert here(*mission, "--lockstep", "--out", tmp_path / "reference").returncode == 0
+    assert digest(out) == digest(tmp_path / "reference")

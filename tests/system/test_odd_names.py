@@ -117,7 +117,7 @@ def test_a_tmc_by_hand_leaves_no_socket_and_notices_that_its_folder_is_gone(tmp_
     line = [*LINE, "tmc", "quick", "--actors", "2", "--bind", "ipc://sync", "--out", "R"]
     for gone in (False, True):
         with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
-            until((tmp_path / "sync.feed").exists, run)
+            until((tmp_path / "sync.learner").exists, run)
             if gone:
                 shutil.rmtree(tmp_path / "R")
             else:
@@ -125,7 +125,7 @@ def test_a_tmc_by_hand_leaves_no_socket_and_notices_that_its_folder_is_gone(tmp_
             _, errors = run.communicate(timeout=PATIENCE_S)
         assert run.returncode == (2 if gone else 143), errors
         assert ("it was removed" in errors) == gone
-        assert not (tmp_path / "sync").exists() and not (tmp_path / "sync.feed").exists()
+        assert not (tmp_path / "sync").exists() and not (tmp_path / "sync.learner").exists()
         shutil.rmtree(tmp_path / "R", ignore_errors=True)
 
 

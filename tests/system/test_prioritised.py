@@ -56,6 +56,6 @@ def test_the_learner_changes_priorities_and_the_journal_has_the_first_ones(tmp_p
     assert mine is not None and first is not None and mine.added == first.added == 3 * 60 * 3
     numbers = np.arange(mine.added)
     changed = mine.mass(numbers) != first.mass(numbers)
-    # PolicySpec was drawn was judged; some 150 minibatches of 16 were, so that few of 540 were never drawn.
+    # A transition that was drawn has an error; some 150 minibatches of 16 were, so that few of 540 were never drawn.
     assert 300 < changed.sum() < mine.added
     assert len(np.unique(first.mass(numbers))) > 400

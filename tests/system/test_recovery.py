@@ -34,9 +34,9 @@ SLOW = line_of_trial(stall=0.01)
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
+def reference_digest(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return the digest of the flight without kills."""
-    out = tmp_path_factory.mktemp("undisturbed") / "R"
+    out = tmp_path_factory.mktemp("reference") / "R"
     assert main([*FLIGHT, "--lockstep", "--out", str(out)]) == 0
     return digest(out)
 
@@ -80,7 +80,9 @@ def kill_all(run: subprocess.Popen[str], running: Running, out: Path) -> None:
         time.sleep(0.02)
 
 
-def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, undisturbed: str, tmp_path: Path) -> None:
+def test_a_tmc_killed_at_five_random_ticks_flies_the_same(
+    running: Running, reference_digest: str, tmp_path: Path
+) -> None:
     out, draw, kills = tmp_path / "R", random.Random(5), 0
     with begin(tmp_path, *FLIGHT, "--out", str(out), line=SLOW) as run:
         while kills < 5:
@@ -95,13 +97,13 @@ def test_a_tmc_killed_at_five_random_ticks_flies_the_same(running: Running, undi
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert errors.count("tmc was killed by SIGKILL; it is started again") == 5
-    assert digest(out) == undisturbed and check(out).good
+    assert digest(out) == reference_digest and check(out).good
     said = [e.message.message for e in Log(out / "tmc.mcap").entries(["/log"])]
     assert sum("the TMC was started again and goes on from tick" in text for text in said) == 5
 
 
 def test_a_flight_goes_on_after_everything_was_killed(
-    overfly: Overfly, here: Overfly, running: Running, undisturbed: str, tmp_path: Path
+    overfly: Overfly, here: Overfly, running: Running, reference_digest: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "R"
     with begin(tmp_path, *FLIGHT, "--out", str(out), line=SLOW) as run:
@@ -113,7 +115,7 @@ def test_a_flight_goes_on_after_everything_was_killed(
     again = overfly("run", "--resume", out, "--no-pictures")
     assert again.returncode == 0, again.stderr
     assert "Uncertainty" in again.stdout
-    assert digest(out) == undisturbed and check(out).good
+    assert digest(out) == reference_digest and check(out).good
     told = json.loads((out / "run.json").read_text())
     assert set(told["exit_codes"].values()) == {0} and told["compacted"]["after"] > 0
     # Finished now: nothing is flown again, and the summary is said.

@@ -127,9 +127,9 @@ def test_a_uav_that_is_killed_comes_back_and_the_run_goes_on(here, running, tmp_
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, errors
     assert killed and "uav-001 was killed by SIGKILL; it is started again" in errors
-    calm = tmp_path / "calm"
-    assert here(*mission, "--lockstep", "--out", calm).returncode == 0
-    assert digest(out) == digest(calm)
+    reference = tmp_path / "reference"
+    assert here(*mission, "--lockstep", "--out", reference).returncode == 0
+    assert digest(out) == digest(reference)
 
 
 def kill_when_up(running: Callable[[str], list[int]], marker: str, out: str, log: Path) -> bool:

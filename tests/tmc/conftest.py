@@ -39,7 +39,7 @@ RASTER = """\
 """
 
 
-class Paused(Exception):  # noqa: N818  it is no error: the pilot has flown one tick and can go on
+class Paused(Exception):  # noqa: N818  not an error: the pilot has flown one tick and can go on
     """Lets a test interleave the pilots tick by tick."""
 
 
@@ -212,7 +212,7 @@ class Mission:
             self.up[i].append(answer)
 
     def _say_again(self, i: int, sequence: int) -> None:
-        """What the TMC has not; a process that took over what TMC and process lost together starts anew."""
+        """Resend what the TMC does not have; a process whose records are lost to both starts again."""
         try:
             self.up[i].extend(self.pilots[i].records_from(sequence))
         except LostRecordsError:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tmc.kernel import files
 from tmc.kernel.config import Config, ConfigError, build, differences
-from tmc.kernel.roadmap import MAP_COPY, USUAL_CELL_M, MapError, RoadMap, map_of_run, parse_raster
+from tmc.kernel.roadmap import DEFAULT_CELL_M, MAP_COPY, MapError, RoadMap, map_of_run, parse_raster
 from tmc.kernel.world import World
 from tmc.record.channels import FORMAT
 from tmc.record.errors import RecordError
@@ -116,7 +116,7 @@ def _map(folder: Path, config: Config, csv: str | None) -> tuple[RoadMap, list[s
         if csv is None:
             raise RecordError(f"the run's map cannot be loaded, and its log has no copy: {error}") from None
         return map_of_csv(world.map, csv), [
-            f"map {world.map}: its file is gone; the log's copy is used, with cells of {USUAL_CELL_M:g} m"
+            f"map {world.map}: its file is gone; the log's copy is used, with cells of {DEFAULT_CELL_M:g} m"
         ]
     if csv is None or road_map.csv() == csv:
         return road_map, []
@@ -124,7 +124,7 @@ def _map(folder: Path, config: Config, csv: str | None) -> tuple[RoadMap, list[s
     return map_of_csv(world.map, csv, road_map.cell_m), [f"map {name}: changed since the run; the log's copy is used"]
 
 
-def map_of_csv(name: str, csv: str, cell_m: float = USUAL_CELL_M) -> RoadMap:
+def map_of_csv(name: str, csv: str, cell_m: float = DEFAULT_CELL_M) -> RoadMap:
     """Return the map in the log. It has no streets and uniform rates, since `RoadMap.csv` holds neither.
 
     RecordError when it is not intact.

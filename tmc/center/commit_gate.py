@@ -3,7 +3,7 @@
 Answers are sent before they are committed, since a restarted TMC gives the same answers again. Three cases are
 different, because a client acts on them in a way that a restarted TMC could not know of:
 
-- *binding*: a UAV that is told of a new episode forgets where it was in the last one; one that is told of a loss stops
+- *binding*: a UAV that hears of a new episode forgets where it was in the last one; one that hears of a loss stops
   looking out for the lost UAV;
 - *another policy*: if TMC and UAV are killed, the UAV's next process must be told the same policy, since peers may have
   seen where the last one flew;

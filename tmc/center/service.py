@@ -149,8 +149,8 @@ class Service:
         sender = sockets.sender_name(identity)
         self._where[sender] = (sock, identity)
         try:
-            if len(frames) > sockets.PARTS:
-                raise CodecError("malformed", f"{len(frames)} frames, at most {sockets.PARTS} are taken")
+            if len(frames) > sockets.MAX_FRAMES:
+                raise CodecError("malformed", f"{len(frames)} frames, at most {sockets.MAX_FRAMES} are taken")
             message = decode(frames)
         except CodecError as error:
             self.station.reject(sender, error.code, str(error))

@@ -1,1 +1,1 @@
-"""The agreement: pure functions and frozen values that every process shares. No sockets, files, clocks or globals."""
+"""The agreement: pure functions and frozen values that all processes share. No sockets, clocks or globals."""

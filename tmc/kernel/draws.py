@@ -1,8 +1,8 @@
 """Addressed randomness: every draw is a pure function of (seed, stream, episode, tick, UAV).
 
 NumPy's Philox is a counter-based generator: its key holds the seed and the stream, its counter the address. No process
-owns a hidden random state, so any process can be restarted, or replaced by another, and draws the same again.
-Raw 64-bit words are turned into floats here, since only the bit stream is guaranteed between NumPy versions.
+has a hidden random state, so a process that is restarted or replaced draws the same numbers. Raw 64-bit words are
+turned into floats here, since NumPy guarantees only the bit stream between versions.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 
 class Stream(IntEnum):
-    """What a draw is for; two streams never share a number."""
+    """The purpose of a draw. Streams are independent of each other."""
 
     STARTS = 1
     AGES = 2
@@ -30,9 +30,9 @@ class Stream(IntEnum):
 def uniforms(
     seed: int, stream: Stream, n: int, *, episode: int = 0, tick: int = 0, uav: int = 0
 ) -> NDArray[np.float64]:
-    """`n` numbers in [0, 1) at one address. Shape (n,), float64, 53 random bits each.
+    """Return `n` numbers in [0, 1) of one address; shape (n,), float64, 53 random bits each.
 
-    The lowest counter word runs within the address, so `n` may be anything below 2^64.
+    The lowest counter word counts within the address, so `n` may be any number below 2^64.
     """
     counter = np.array([0, tick, uav, episode], np.uint64)
     bits = Philox(key=np.array([seed, int(stream)], np.uint64), counter=counter)
@@ -41,7 +41,7 @@ def uniforms(
 
 
 def distinct(u: NDArray[np.float64], candidates: NDArray[np.int64], n: int) -> list[int]:
-    """`n` different candidates, each equally likely, from `n` uniforms (Fisher-Yates from the front)."""
+    """Return `n` different candidates, each equally likely, from `n` uniforms `u` (Fisher-Yates from the front)."""
     pool = [int(c) for c in candidates]
     for i in range(n):
         j = i + int(u[i] * (len(pool) - i))

@@ -1,4 +1,4 @@
-"""Files that others made: only regular ones are read, so that none blocks for ever; and words of others on one line."""
+"""Read foreign files, only regular ones, so that no read blocks; and put foreign text on one line."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ KINDS = (
     (stat.S_ISCHR, "it is a device"),
     (stat.S_ISBLK, "it is a device"),
 )
-"""What a path may name that is no file, and the words for it; of a folder the system says so."""
-_NEVER_WAIT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_CLOEXEC", 0)
+"""Kinds of paths that are not files, in words. The system itself reports folders."""
+_NON_BLOCKING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def check(path: str | os.PathLike[str]) -> None:
@@ -27,23 +27,23 @@ def check(path: str | os.PathLike[str]) -> None:
 
 
 def opened(path: str | os.PathLike[str]) -> IO[bytes]:
-    """Open a regular file to read bytes. OSError as `check`; never waits for another process."""
-    check(path)  # first: to open a device may already do something
-    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NEVER_WAIT))
+    """Open a regular file to read bytes. Raises OSError as `check` does; never waits for another process."""
+    check(path)  # first, since opening a device may have an effect
+    return open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NON_BLOCKING))
 
 
-def read_bytes(path: str | os.PathLike[str], most: int = -1) -> bytes:
-    """The bytes of a regular file, the first `most` of them when given. OSError as `opened`."""
+def read_bytes(path: str | os.PathLike[str], limit_bytes: int = -1) -> bytes:
+    """Return the bytes of a regular file, at most `limit_bytes` when given. Raises OSError as `opened` does."""
     with opened(path) as file:
-        return file.read(most) or b""  # None: a file of the kernel's that would make its reader wait
+        return file.read(limit_bytes) or b""  # None: a file of the system that would block
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """The text of a regular file in UTF-8. OSError as `opened`; UnicodeDecodeError, a ValueError, for other text."""
+    """Return the text of a regular UTF-8 file. Raises OSError as `opened` does; UnicodeDecodeError (a ValueError)."""
     return read_bytes(path).decode("utf-8")
 
 
-def plain(text: object, longest: int = 500) -> str:
-    """Text of others as one line of a message: blanks for control characters, and not longer than `longest`."""
+def plain(text: object, limit_chars: int = 500) -> str:
+    """Return foreign text as one line of at most `limit_chars` characters, with blanks for control characters."""
     line = "".join(c if c.isprintable() else " " for c in str(text)).strip()
-    return line if len(line) <= longest else line[: longest - 1] + "…"
+    return line if len(line) <= limit_chars else line[: limit_chars - 1] + "…"

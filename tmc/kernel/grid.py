@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-# The paper's own order (Sec. III-B, Action): (d_row, d_col) for each action id.
+# (name, d_row, d_col) of each action id, in the paper's order (Sec. III-B, Action).
 ACTIONS: tuple[tuple[str, int, int], ...] = (
     ("N", -1, 0),
     ("S", +1, 0),
@@ -45,11 +45,12 @@ class Grid:
         return self.rows * self.cols
 
     def cell(self, row: int, col: int) -> int:
+        """Return the cell at a row and a column."""
         return row * self.cols + col
 
     @cached_property
     def targets(self) -> NDArray[np.int32]:
-        """Shape (K, 9): the cell that each action leads to, or OFF_GRID."""
+        """The cell that each action leads to, or OFF_GRID; shape (K, 9), int32."""
         table = np.full((self.size, N_ACTIONS), OFF_GRID, np.int32)
         rows, cols = np.divmod(np.arange(self.size), self.cols)
         for a, (_, dr, dc) in enumerate(ACTIONS):
@@ -60,21 +61,21 @@ class Grid:
 
     @cached_property
     def target_lists(self) -> list[list[int]]:
-        """`targets` as plain lists: indexing one element of an array costs several times more."""
+        """`targets` as lists: indexing one element of an array is several times slower."""
         return [[int(k) for k in row] for row in self.targets]
 
     def chebyshev(self, a: int, b: int) -> int:
-        """Moves that a UAV needs from cell `a` to cell `b` with nothing in its way."""
+        """Return the moves that a UAV needs from cell `a` to cell `b` without obstacles."""
         (ra, ca), (rb, cb) = divmod(a, self.cols), divmod(b, self.cols)
         return max(abs(ra - rb), abs(ca - cb))
 
     def within(self, a: int, b: int, radius: float) -> bool:
-        """True when the centres of the two cells are at most `radius` cell widths apart (Euclidean, Sec. II-C)."""
+        """Return True when the centres of two cells are at most `radius` cell widths apart (Euclidean, Sec. II-C)."""
         (ra, ca), (rb, cb) = divmod(a, self.cols), divmod(b, self.cols)
         return (ra - rb) ** 2 + (ca - cb) ** 2 <= radius * radius + 1e-9
 
     def window(self, radius: int) -> NDArray[np.int32]:
-        """Shape (K, (2 radius + 1)^2): the cells around each cell, row by row; K stands for "off the grid"."""
+        """Return the cells around each cell, row by row, K where off the grid; shape (K, (2 radius + 1)^2), int32."""
         rows, cols = np.divmod(np.arange(self.size), self.cols)
         d = np.arange(-radius, radius + 1)
         r = rows[:, None, None] + d[None, :, None]

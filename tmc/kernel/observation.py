@@ -1,4 +1,4 @@
-"""The observation o_i(t) = [P_i(t), M, U_i(t)] (eq. 12), as a UAV builds it and as the replay rebuilds it, bit for bit.
+"""Build the observation o_i(t) = [P_i(t), M, U_i(t)] (eq. 12). A UAV and the replay memory build the same bits.
 
 Channels: P, ego 1.0 and sensed peers 0.5; M, road 1, free 0, blocked or off the grid -1; U, the UAV's own map. The
 view is the whole grid, or the square of `2 radius + 1` cells around the UAV.
@@ -23,9 +23,9 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Views:
-    """What B observations are made of: what is sent instead of images, an eighth of their size with the paper's map.
+    """The content of B observations. It is sent instead of images: an eighth of the size with the paper's map.
 
-    `cells` (B,) uint16: where the UAV stands. `peers` (B, P) uint16: cells of the sensed UAVs; K where there are fewer.
+    `cells` (B,) uint16: cell of the UAV. `peers` (B, P) uint16: cells of the sensed UAVs; K where there are fewer.
     `u` (B, R) float32: the UAV's own map, over the monitored cells.
     """
 
@@ -34,7 +34,7 @@ class Views:
     u: Floats
 
     def rows(self, which: slice | NDArray[np.int64]) -> Views:
-        """Some of them."""
+        """Return a subset, by slice or index."""
         return Views(self.cells[which], self.peers[which], self.u[which])
 
 
@@ -54,14 +54,14 @@ def allowed_in(observation: Floats) -> list[int]:
 
 
 class ObservationBuilder:
-    """Builds observations of one world; holds tables, no state."""
+    """Build observations of one world. Holds tables, no state."""
 
     def __init__(self, world: World) -> None:
         config, grid = world.config, world.grid
         self.grid = grid
         self.shape = view_shape(config, grid)
         self.sensing = np.inf if config.scenario == 1 else config.team.sensing_range
-        """r_s in cell widths; everyone knows all positions in scenario I (Sec. II-C)."""
+        """r_s in cell widths; infinite in scenario I, where every UAV knows all positions (Sec. II-C)."""
         self._whole = config.observation.view == "whole"
         K, R = grid.size, world.law.cells.size
         self.R = R
@@ -72,25 +72,28 @@ class ObservationBuilder:
         self._terrain = np.append(terrain, -1.0).astype(np.float32)[self._window]
         blank = np.stack([np.zeros_like(self._terrain[0]), self._terrain[0], np.zeros_like(self._terrain[0])])
         self._blank = blank, np.ascontiguousarray(blank.T).T
-        """An image of nothing but the terrain, (3, K); and the same with the channels last in memory: what lies alike
-        is copied whole."""
-        place = np.append(np.where(world.law.index < 0, R, world.law.index), R)
-        self._place = place[self._window].astype(np.int64)
+        """An image of the terrain alone, (3, K), with channels first and with channels last in memory. An image in
+        the same order is copied in one step."""
+        index = np.append(np.where(world.law.index < 0, R, world.law.index), R)
+        self._index = index[self._window].astype(np.int64)
         self._monitored = world.law.cells.astype(np.int64)
         targets = np.where(grid.targets == OFF_GRID, 0, grid.targets)
         self.free = (grid.targets != OFF_GRID) & ~world.map.blocked[targets]
-        """Shape (K, 9): moves that neither the grid's edge nor an obstacle blocks."""
+        """Moves that neither the grid's edge nor an obstacle blocks; shape (K, 9), bool."""
         self._free_lists = [[a for a in range(STAY + 1) if row[a]] for row in self.free]
         self._rows, self._cols = np.divmod(np.arange(K + 1), grid.cols)
 
     def observe(self, cell: int, peers: list[int], u: NDArray[np.float64], out: Floats | None = None) -> Floats:
-        """o_i(t), shape (C, H, W), float32. `peers`: cells of the sensed UAVs; `u`: shape (R,), the UAV's own map."""
+        """Return o_i(t), shape (C, H, W), float32; drawn into `out` when given.
+
+        `peers`: cells of the sensed UAVs. `u`: the UAV's own map, shape (R,).
+        """
         flat = np.empty((3, self._window.shape[1]), np.float32) if out is None else out.reshape(3, -1)
         row = 0 if self._whole else cell
         flat[1] = self._terrain[row]
         padded = np.zeros(u.size + 1)
         padded[:-1] = u
-        flat[2] = padded[self._place[row]]
+        flat[2] = padded[self._index[row]]
         flat[0] = 0.0
         for peer in peers:
             self._mark(flat[0], cell, peer, PEER)
@@ -99,11 +102,11 @@ class ObservationBuilder:
 
     @property
     def first_cell(self) -> int:
-        """A cell that a UAV may look from."""
+        """A cell on which a UAV may be."""
         return int(self._monitored[0])
 
     def canvas(self) -> Canvas:
-        """An image of its own for one who looks again and again."""
+        """Return an image that is drawn again at each tick."""
         return Canvas(self, self._monitored if self._whole else None)
 
     def _mark(self, plane: Floats, cell: int, where: int, value: float) -> None:
@@ -117,32 +120,32 @@ class ObservationBuilder:
             plane[y * side + x] = value
 
     def allowed(self, cell: int, peers: list[int]) -> list[int]:
-        """Actions that nothing the UAV knows of blocks: grid, obstacles, and the cells of sensed peers. Never empty."""
+        """Return the actions that neither grid, obstacles nor sensed peers block. Never empty: the UAV may stay."""
         targets = self.grid.target_lists[cell]
         return [a for a in self._free_lists[cell] if targets[a] not in peers]
 
     def sensed(self, cells: Ints, team: Ints, uav: Ints) -> NDArray[np.bool_]:
-        """N_i(t) for a batch: shapes (B,), (B, N), (B,) -> (B, N), True where the other UAV is within r_s."""
+        """Return N_i(t) for a batch, True where the other UAV is within r_s; (B,), (B, N), (B,) -> (B, N), bool."""
         if np.isinf(self.sensing):
             near = np.ones(team.shape, bool)
         else:
             dr = self._rows[team] - self._rows[cells][:, None]
             dc = self._cols[team] - self._cols[cells][:, None]
             near = dr * dr + dc * dc <= self.sensing * self.sensing + 1e-9
-        near &= team < self.grid.size  # K stands for a UAV that was lost
+        near &= team < self.grid.size  # K stands for a lost UAV
         near[np.arange(len(uav)), uav] = False
         return near
 
     def views(self, cells: Ints, team: Ints, uav: Ints, u: Floats) -> Views:
-        """What UAVs `uav` see: shapes (B,), (B, N), (B,), (B, R)."""
+        """Return the views of UAVs `uav`; shapes (B,), (B, N), (B,), (B, R)."""
         peers = np.sort(np.where(self.sensed(cells, team, uav), team, self.grid.size), axis=1)
-        most = int((peers < self.grid.size).sum(axis=1).max(initial=0))
-        return Views(cells.astype("<u2"), peers[:, :most].astype("<u2"), u)
+        columns = int((peers < self.grid.size).sum(axis=1).max(initial=0))
+        return Views(cells.astype("<u2"), peers[:, :columns].astype("<u2"), u)
 
     def observe_batch(self, views: Views, images: Floats | None = None) -> Floats:
-        """Observations of a batch, (B, C, H, W), the same bits as `observe`; drawn into `images` when given.
+        """Return the observations of a batch, (B, C, H, W), float32, the same bits as `observe`.
 
-        `images` may lie in memory as it likes: channels last, for one.
+        Drawn into `images` when given, which may have any memory order, such as channels last.
         """
         B, cells, u = views.cells.size, views.cells.astype(np.int64), views.u
         drawn = np.empty((B, *self.shape), np.float32) if images is None else images
@@ -151,17 +154,17 @@ class ObservationBuilder:
         batch, peer = np.nonzero(views.peers < self.grid.size)
         self._mark_batch(out, batch, cells[batch], views.peers[batch, peer].astype(np.int64), PEER)
         self._mark_batch(out, np.arange(B), cells, cells, EGO)
-        if self._whole:  # only the monitored cells are written: a gather of all of them takes three times as long
+        if self._whole:  # writes the monitored cells only, in a third of the time of a gather
             out[:, 2][:, self._monitored] = u
         else:
             padded = np.zeros((B, u.shape[1] + 1), np.float32)
             padded[:, :-1] = u
             out[:, 1] = self._terrain[cells]
-            out[:, 2] = padded.ravel().take(self._place[cells] + np.arange(0, padded.size, padded.shape[1])[:, None])
+            out[:, 2] = padded.ravel().take(self._index[cells] + np.arange(0, padded.size, padded.shape[1])[:, None])
         return drawn
 
     def _mark_batch(self, out: Floats, batch: Ints, cells: Ints, where: Ints, value: float) -> None:
-        """As `_mark`, for images `batch` of UAVs on `cells`; shapes (n,)."""
+        """Do as `_mark`, for images `batch` of UAVs on `cells`; shapes (n,)."""
         if self._whole:
             out[batch, 0, where] = value
             return
@@ -172,15 +175,14 @@ class ObservationBuilder:
         out[batch[seen], 0, (y * side + x)[seen]] = value
 
     def allowed_batch(self, views: Views) -> NDArray[np.uint8]:
-        """Shape (B, 9): 1 for the actions that `allowed` lists."""
+        """Return 1 for the actions that `allowed` lists; shape (B, 9), uint8."""
         targets = self.grid.targets[views.cells]
         held = (targets[:, :, None] == views.peers[:, None, :]).any(axis=2)
         return np.asarray(self.free[views.cells] & ~held, np.uint8)
 
 
 class Canvas:
-    """One image that is drawn over in place, the same bits as `ObservationBuilder.observe`: what stays is not drawn
-    again.
+    """Draw o_i(t) over and over into one image, the same bits as `ObservationBuilder.observe`; draw only what changes.
 
     `monitored`: the cells of U in a view of the whole grid; None where the view moves with the UAV.
     """
@@ -193,7 +195,7 @@ class Canvas:
         self._marked: list[int] | None = None
 
     def draw(self, cell: int, peers: list[int], u: NDArray[np.float64]) -> None:
-        """Make it o_i(t); arguments as for `ObservationBuilder.observe`."""
+        """Draw o_i(t); arguments as for `ObservationBuilder.observe`."""
         if self._monitored is None or self._marked is None:
             self._observer.observe(cell, peers, u, self.image[0])
         else:

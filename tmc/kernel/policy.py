@@ -1,4 +1,4 @@
-"""What a policy file says of itself: the description inside an ONNX model, so that no policy flies where it cannot."""
+"""The description inside an ONNX policy file, so that a policy that does not fit a mission is refused."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ N_CHANNELS = 3
 
 
 class PolicyError(OverflyError, ValueError):
-    """A policy that cannot fly here: one sentence with the fix."""
+    """A policy cannot fly here. The text is one sentence with the fix."""
 
 
 class FlightError(PolicyError):
-    """A policy that failed in flight, which no look at the file could tell."""
+    """A policy failed in flight, which its file did not show."""
 
 
 _RANGES = {
     "channels": (N_CHANNELS, N_CHANNELS), "height": (1, 65_535), "width": (1, 65_535),
     "actions": (N_ACTIONS, N_ACTIONS), "scenario": (1, 2), "version": (0, 2**62), "updates": (0, 2**62),
 }  # fmt: skip
-"""What the numbers of a description may be; those that are settings too have the ranges of these."""
+"""Ranges of the numbers in a description. Numbers that are settings too have the ranges of the settings."""
 
 
 @dataclass(frozen=True)
 class PolicyCard:
-    """The description. `view`, `radius`, `near`: as in the settings `observation.*` it was trained with."""
+    """The description of a policy. `view`, `radius`, `near`: its settings `observation.*` in training."""
 
     channels: int
     height: int
@@ -51,32 +51,33 @@ class PolicyCard:
     format: int = FORMAT
 
     def to_json(self) -> str:
+        """Return the description as JSON."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @staticmethod
     def from_json(text: str) -> PolicyCard:
-        """Read a description; raises PolicyError unless every value in it can be."""
-        none = "the file is not an Overfly policy: its description"
+        """Parse a description; PolicyError unless every value is valid."""
+        prefix = "the file is not an Overfly policy: its description"
         try:
             found = json.loads(text)
         except (ValueError, RecursionError):
-            raise PolicyError(f"{none} cannot be read, as it is not JSON") from None
+            raise PolicyError(f"{prefix} is not JSON") from None
         if not isinstance(found, dict):
-            raise PolicyError(f"{none} cannot be read, as it is not a JSON object")
+            raise PolicyError(f"{prefix} is not a JSON object")
         if type(found.get("format")) is int and found["format"] != FORMAT:
             raise PolicyError(f"the policy has format {plain(found['format'], 40)}, this Overfly reads format {FORMAT}")
         names = {f.name for f in fields(PolicyCard)}
         if missing := sorted(names - found.keys() - {"format"}):
-            raise PolicyError(f"{none} lacks {', '.join(missing)}")
+            raise PolicyError(f"{prefix} lacks {', '.join(missing)}")
         if unknown := sorted(found.keys() - names):
-            raise PolicyError(f"{none} has the unknown key {plain(unknown[0], 40)!r}")
+            raise PolicyError(f"{prefix} has the unknown key {plain(unknown[0], 40)!r}")
         card = PolicyCard(**found)
         if wrong := card._wrong():
-            raise PolicyError(f"{none} has {wrong}")
+            raise PolicyError(f"{prefix} has {wrong}")
         return card
 
     def _wrong(self) -> str:
-        """The first value that cannot be, and what it may be; empty when there is none."""
+        """Return the first invalid value, and what is valid; empty when there is none."""
         for f in fields(PolicyCard):
             value = getattr(self, f.name)
             if type(value).__name__ != f.type:
@@ -87,7 +88,7 @@ class PolicyCard:
         try:
             build({"observation.view": self.view, "observation.radius": self.radius, "observation.near": self.near})
         except ConfigError as error:
-            return f"a view that cannot be ({plain(error, 120)})"
+            return f"an invalid view ({plain(error, 120)})"
         side = 2 * self.radius + 1
         if self.view == "ego" and (self.height, self.width) != (side, side):
             return f"{self.height} x {self.width} cells, where a radius of {self.radius} has {side} x {side}"
@@ -95,7 +96,7 @@ class PolicyCard:
 
 
 def view_shape(config: Config, grid: Grid) -> tuple[int, int, int]:
-    """(channels, height, width) of an observation under these settings."""
+    """Return (channels, height, width) of an observation under these settings."""
     if config.observation.view == "ego":
         side = 2 * config.observation.radius + 1
         return N_CHANNELS, side, side
@@ -103,7 +104,7 @@ def view_shape(config: Config, grid: Grid) -> tuple[int, int, int]:
 
 
 def features(network: NetworkConfig, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns after the last convolution, with `padding`; raises ConfigError when a view is too small."""
+    """Return rows and columns after the last convolution, with `padding`; ConfigError when a view is too small."""
     if not _sides(network, min(height, width)):
         raise ConfigError(
             f"a view of {height} x {width} cells is too small for {len(network.channels)} convolutions with "
@@ -115,10 +116,10 @@ def features(network: NetworkConfig, height: int, width: int) -> tuple[int, int]
 
 
 def padding(network: NetworkConfig, side: int) -> int:
-    """Rows or columns of zeros that are put behind the last one, so that every cell of `side` counts.
+    """Return the rows or columns of zeros to append, so that the convolutions see every cell of `side`.
 
-    Kernels that go in strides may leave some over at the end: of 17 cells, two of 4 by strides of 2 see 14. The paper's
-    30 they see whole, without padding.
+    With strides, kernels may leave out the last cells: of 17 cells, two kernels of 4 with strides of 2 see 14. The
+    paper's 30 cells need no padding.
     """
     more = 0
     while not _sides(network, side + more) or _left_over(network, side + more):
@@ -127,7 +128,7 @@ def padding(network: NetworkConfig, side: int) -> int:
 
 
 def _sides(network: NetworkConfig, side: int) -> list[int]:
-    """What is left of `side` after each convolution; empty when it is too small for one of them."""
+    """Return the side after each convolution; empty when `side` is too small."""
     sides = []
     for _ in network.channels:
         if side < network.kernel:
@@ -138,13 +139,13 @@ def _sides(network: NetworkConfig, side: int) -> list[int]:
 
 
 def _left_over(network: NetworkConfig, side: int) -> bool:
-    """Whether a convolution sees less than all of what it is given."""
+    """Return True when a convolution leaves out cells of its input."""
     given = [side, *_sides(network, side)[:-1]]
     return any((n - network.kernel) % network.stride for n in given)
 
 
 def policy_bytes(config: Config, shape: tuple[int, int, int]) -> int:
-    """About how large the policy file of a network is, bytes: its weights, and room for all that names them."""
+    """Estimate the size of a policy file, bytes: the weights, and room for their names."""
     network, (channels, height, width) = config.network, shape
     rows, cols = features(network, height, width)
     sizes, before = [], channels
@@ -157,7 +158,7 @@ def policy_bytes(config: Config, shape: tuple[int, int, int]) -> int:
 
 
 def check_view(config: Config, shape: tuple[int, int, int]) -> None:
-    """Raise ConfigError when the network of these settings cannot take observations of this shape."""
+    """Raise ConfigError when the network of these settings does not fit observations of this shape."""
     near = config.observation.near
     if 2 * near + 1 > min(shape[1:]):
         raise ConfigError(
@@ -167,7 +168,7 @@ def check_view(config: Config, shape: tuple[int, int, int]) -> None:
 
 
 def card_for(config: Config, grid: Grid, version: int, updates: int) -> PolicyCard:
-    """The description of a policy trained with these settings."""
+    """Return the description of a policy that is trained with these settings."""
     channels, height, width = view_shape(config, grid)
     view = config.observation
     return PolicyCard(

@@ -1,6 +1,6 @@
-"""From streets on the globe to cells: the projection, the raster rule, and floods over the grid.
+"""Convert streets on the globe to cells: the projection, the raster rule, and floods over the grid.
 
-Distances are metres unless a name says otherwise; x runs street-east and y street-north from the south-west corner.
+Distances are in metres unless a name says otherwise; x runs street-east and y street-north from the south-west corner.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from tmc.kernel.grid import OFF_GRID, Grid
 
 STEPS_PER_CELL = 40
+"""Samples per cell width along a street."""
 UNREACHABLE = 2**30
-"""The distance of a cell that no move leads to; large, so that a minimum over neighbours never picks it."""
+"""The distance of a cell that cannot be reached. It is large, so that a minimum over neighbours never picks it."""
 
 
 @dataclass(frozen=True)
 class Georeference:
     """The affine map between WGS84 and a grid: `x = a (lon - lon0) + b (lat - lat0) + c`, and `y` likewise.
 
-    `x` and `y` hold (a, b, c) in metres a degree and metres; `origin` is (lon0, lat0) in degrees.
+    `x` and `y` hold (a, b, c) in metres per degree, and metres; `origin` is (lon0, lat0) in degrees.
     """
 
     grid: Grid
@@ -33,12 +34,12 @@ class Georeference:
     y: tuple[float, float, float]
 
     def metres(self, lonlat: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Shape (..., 2), (lon, lat) in degrees -> shape (..., 2), (x, y) in metres."""
+        """Convert (lon, lat) in degrees, shape (..., 2), to (x, y) in metres, shape (..., 2)."""
         slopes, shift = np.array([self.x[:2], self.y[:2]]), np.array([self.x[2], self.y[2]])
         return np.asarray((lonlat - np.array(self.origin)) @ slopes.T + shift)
 
     def lonlat(self, cell: int) -> tuple[float, float]:
-        """(lon, lat) of the centre of `cell`, in degrees."""
+        """Return (lon, lat) of the centre of `cell`, degrees."""
         row, col = divmod(cell, self.grid.cols)
         u = (col + 0.5) * self.cell_m - self.x[2]
         v = (self.grid.rows - row - 0.5) * self.cell_m - self.y[2]
@@ -47,23 +48,24 @@ class Georeference:
         return self.origin[0] + (d * u - b * v) / det, self.origin[1] + (a * v - c * u) / det
 
     def cell_at(self, lon: float, lat: float) -> int | None:
-        """The cell that holds a point, or None when it lies outside the window."""
+        """Return the cell that holds a point, or None when it lies outside the window."""
         x, y = self.metres(np.array([lon, lat]))
         row, col = self.grid.rows - 1 - math.floor(y / self.cell_m), math.floor(x / self.cell_m)
         inside = 0 <= row < self.grid.rows and 0 <= col < self.grid.cols
         return self.grid.cell(row, col) if inside else None
 
     def street_cells(self, lonlat: NDArray[np.float64]) -> list[int]:
-        """The cells of one street, by the raster rule. Shape (V, 2) degrees -> cells inside the window, in order."""
+        """Return the cells of one street inside the window, in order, by the raster rule. `lonlat`: (V, 2), degrees."""
         path = thin(walk(self.metres(lonlat) / self.cell_m))
         rows, cols = self.grid.rows, self.grid.cols
         return [self.grid.cell(rows - 1 - y, x) for x, y in path if 0 <= x < cols and 0 <= y < rows]
 
 
 def walk(points: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """The (x, y) squares that a polyline passes, in order, each once in a row.
+    """Return the (x, y) squares that a polyline passes, in order, without immediate repeats.
 
-    Shape (V, 2), in cell widths. The line is sampled every fortieth of a cell, so a corner cut by less may be missed.
+    `points`: shape (V, 2), in cell widths. The line is sampled STEPS_PER_CELL times per cell width, so a square that
+    it cuts by less may be missed.
     """
     squares: list[tuple[int, int]] = []
     for start, end in pairwise(points):
@@ -76,7 +78,7 @@ def walk(points: NDArray[np.float64]) -> list[tuple[int, int]]:
 
 
 def thin(squares: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Drops each corner square whose neighbours on the path already touch: a thin, 8-connected path is left.
+    """Drop each corner square whose neighbours on the path touch, which leaves a thin, 8-connected path.
 
     "Neighbours" are the last square kept and the next one of the walk, so a staircase loses every second square.
     """
@@ -92,9 +94,10 @@ def _touch(a: tuple[int, int], b: tuple[int, int]) -> bool:
 
 
 def flood(grid: Grid, start: NDArray[np.bool_], passable: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Shape (K,): the fewest moves from any `start` cell over `passable` cells, or UNREACHABLE.
+    """Return the fewest moves from any `start` cell over `passable` cells, or UNREACHABLE; shape (K,), int32.
 
-    A move goes to one of the 8 neighbours; as in the model only its target matters, so it may squeeze past a corner.
+    A move goes to one of the 8 neighbours. As in the model, only its target must be passable, so it may pass between
+    two blocked cells diagonally.
     """
     distance = np.full(grid.size, UNREACHABLE, np.int32)
     frontier = np.flatnonzero(start)
@@ -109,7 +112,7 @@ def flood(grid: Grid, start: NDArray[np.bool_], passable: NDArray[np.bool_]) -> 
 
 
 def components(grid: Grid, cells: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """The 8-connected pieces of a set of cells, shape (K,), largest first; each ascending."""
+    """Return the 8-connected components of a set of cells, shape (K,), largest first; each in ascending order."""
     left, pieces = cells.copy(), []
     while left.any():
         seed = np.zeros(grid.size, np.bool_)

@@ -1,6 +1,6 @@
-"""The road map that all parties agree on (Sec. II): which cells are road, which are closed, and how busy each one is.
+"""The road map (Sec. II): which cells are road, which are blocked, and the event rate of each.
 
-Reading the built-in maps (`maps/*.json`, package data) and a user's text raster is all that the kernel reads.
+The kernel reads no files but the built-in maps (`maps/*.json`, package data) and a user's text raster.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ __all__ = [
 
 ROADS = ("major", "main", "arterial", "all")
 OBSTACLES = ("none", "static", "event-day")
-USUAL_CELL_M = 60.0
-"""The width of a cell, metres, where a text raster names none: the built-in map's."""
+DEFAULT_CELL_M = 60.0
+"""Width of a cell, metres, of a text raster without one: that of the built-in map."""
 MAP_COPY = "map.txt"
-"""The copy of a user's map in the run folder, so that the folder is enough to go on with the run, wherever it lies."""
+"""Name of the copy of a user's map in the run folder. With it, the folder is enough to resume the run elsewhere."""
 Scalar = TypeVar("Scalar", bound=np.generic)
-MAX_BYTES = 2**18  # 65,535 one-cell rows with CRLF need 196,605 bytes; the rest is room for a header
+MAX_RASTER_BYTES = 2**18  # 65,535 one-cell rows with CRLF have 196,605 bytes; the rest is room for a header
 
 
 @dataclass(frozen=True)
 class Street:
-    """A street of a built-in map; `lonlat` are its vertices in degrees, (lon, lat) each."""
+    """A street of a built-in map. `lonlat`: its vertices, (lon, lat) in degrees."""
 
     name: str
     road_class: str
@@ -58,12 +58,12 @@ class Street:
 
 @dataclass(frozen=True, eq=False)
 class RoadMap:
-    """A grid of square cells, each road, free or blocked; never both road and blocked. Arrays are read-only.
+    """A grid of square cells, each road, free or blocked. Arrays are read-only.
 
-    `road`, `blocked`: shape (K,). `blocked` holds static obstacles and no-fly cells. `cell_m`: metres.
-    `rates`: name -> shape (K,), relative, mean 1 over the road cells and 0 elsewhere; "uniform" is always there.
-    `streets`: those that the preset turned into road; empty for a user's raster. `source`: the text of a user's raster,
-    with its name, whatever is left out of the map; empty for a built-in map.
+    `road`, `blocked`: shape (K,), bool. `blocked`: static obstacles and no-fly cells. `cell_m`: width, metres.
+    `rates`: {name: shape (K,)}, relative, mean 1 over the road cells and 0 elsewhere; "uniform" always exists.
+    `streets`: those that are road in this preset; empty for a user's raster.
+    `source`: the complete text of a user's raster, with its name; empty for a built-in map.
 
     Raises MapError when the arrays disagree.
     """
@@ -82,47 +82,47 @@ class RoadMap:
     def __post_init__(self) -> None:
         rates = {"uniform": self.road.astype(np.float64), **self.rates}
         if any(a.shape != (self.grid.size,) for a in (self.road, self.blocked, *rates.values())):
-            raise MapError(f"map '{self.name}' has an array without one value a cell: give {self.grid.size} in each")
+            raise MapError(f"map '{self.name}' has an array without one value per cell: give {self.grid.size} in each")
         if not self.road.any():
             raise MapError(f"map '{self.name}' has no road cell, so there is nothing to patrol: mark some as road")
         if (self.road & self.blocked).any():
             raise MapError(f"map '{self.name}' has cells that are road and blocked: choose one for each")
         if not CELL_M[0] <= self.cell_m <= CELL_M[1]:
-            mend = f"give a width from {CELL_M[0]:g} to {CELL_M[1]:,.0f}"
-            raise MapError(f"map '{self.name}' has cells of {self.cell_m:g} m: {mend}")
+            fix = f"give a width from {CELL_M[0]:g} to {CELL_M[1]:,.0f}"
+            raise MapError(f"map '{self.name}' has cells of {self.cell_m:g} m: {fix}")
         object.__setattr__(self, "road", _frozen(self.road))
         object.__setattr__(self, "blocked", _frozen(self.blocked))
         object.__setattr__(self, "rates", {name: _frozen(rate) for name, rate in rates.items()})
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256, hex, of the grid, road and blocked cells: two parties with the same one fly over the same map."""
+        """SHA-256 (hex) of the grid, road and blocked cells: processes with the same one use the same map."""
         shape = f"{self.grid.rows}x{self.grid.cols}:".encode()
         return hashlib.sha256(shape + self._codes.tobytes()).hexdigest()
 
     @cached_property
     def road_distance(self) -> NDArray[np.int32]:
-        """Shape (K,): moves to the nearest road cell around what is blocked; UNREACHABLE (2^30) where there is no way.
+        """Moves to the nearest road cell around blocked cells; shape (K,), int32.
 
-        0 on road; blocked cells are UNREACHABLE as well.
+        0 on road; UNREACHABLE (2^30) on blocked cells and where there is no way.
         """
         return _frozen(flood(self.grid, self.road, ~self.blocked))
 
     @cached_property
     def _codes(self) -> NDArray[np.uint8]:
-        """Shape (K,): 0 free, 1 road, 2 blocked."""
+        """0 free, 1 road, 2 blocked; shape (K,), uint8."""
         return np.where(self.blocked, 2, self.road).astype(np.uint8)
 
     def lonlat(self, cell: int) -> tuple[float, float] | None:
-        """(lon, lat) of the centre of `cell` in degrees, or None where the map has no georeference."""
+        """Return (lon, lat) of the centre of `cell`, degrees; None where the map has no georeference."""
         return None if self.georeference is None else self.georeference.lonlat(cell)
 
     def csv(self) -> str:
-        """A line a row from the north: comma separated, 0 free, 1 road, 2 blocked; no header."""
+        """Return one line per row from the north: comma separated, 0 free, 1 road, 2 blocked; no header."""
         return "".join(",".join(str(c) for c in row) + "\n" for row in self._rows())
 
     def text(self) -> str:
-        """The raster that `load_map` reads: a line a row from the north, `.` free, `#` road, `X` blocked; no header."""
+        """Return the raster that `load_map` reads, without a header: one line per row from the north."""
         return "".join("".join((FREE, ROAD, BLOCKED)[c] for c in row) + "\n" for row in self._rows())
 
     def _rows(self) -> list[list[int]]:
@@ -131,25 +131,25 @@ class RoadMap:
 
 
 def _frozen(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """A read-only copy: maps are shared by all that fly over them."""
+    """Return a read-only copy, since maps are shared."""
     copy = array.copy()
     copy.setflags(write=False)
     return copy
 
 
 def builtin_maps() -> tuple[str, ...]:
-    """Names of the maps that ship with Overfly."""
+    """Return the names of the maps that ship with Overfly."""
     folder = files("tmc.kernel").joinpath("maps")
     return tuple(sorted(f.name.removesuffix(".json") for f in folder.iterdir() if f.name.endswith(".json")))
 
 
 def load_map(name: str, roads: str = "main", obstacles: str = "static") -> RoadMap:
-    """The built-in map `name`, or the text raster at that path.
+    """Return the built-in map `name`, or the text raster at that path.
 
-    `roads` says which classes are road: "major", "main" (major, plus Front and Church, which close the perimeter),
+    `roads`: the classes that are road: "major", "main" (major, plus Front and Church, which close the perimeter),
     "arterial" or "all" (with collectors); a text raster has no classes, so all its roads count. `obstacles`: "none",
     "static", or "event-day" (static, plus the event-day no-fly cells); a text raster keeps its X unless "none".
-    A road cell wins over a static obstacle; the event-day restriction closes road cells too. Raises MapError.
+    Where both apply, a cell is road, not a static obstacle; event-day cells are closed even on road. Raises MapError.
     """
     _choice("roads", roads, ROADS)
     _choice("obstacles", obstacles, OBSTACLES)
@@ -160,7 +160,7 @@ def load_map(name: str, roads: str = "main", obstacles: str = "static") -> RoadM
 
 
 def map_of_run(folder: Path, name: str, roads: str, obstacles: str) -> RoadMap:
-    """As `load_map`, for a run in `folder`: its own copy of a user's map wins, whatever became of the file."""
+    """Return the map of a run in `folder`, as `load_map` does. The folder's copy of a user's map takes precedence."""
     copy = folder / MAP_COPY
     own = name not in builtin_maps() and copy.exists()
     return load_map(str(copy) if own else name, roads, obstacles)
@@ -174,7 +174,7 @@ def _choice(setting: str, value: str, known: tuple[str, ...]) -> None:
 def _read(path: str) -> str:
     shown = regular.plain(path)
     try:
-        raw = regular.read_bytes(path, MAX_BYTES + 1)
+        raw = regular.read_bytes(path, MAX_RASTER_BYTES + 1)
         text = raw.decode("utf-8-sig")
     except FileNotFoundError:
         near = nearest(path, builtin_maps())
@@ -182,18 +182,18 @@ def _read(path: str) -> str:
         raise MapError(f"no map and no file is called '{shown}': {fix}") from None
     except UnicodeDecodeError as error:
         raise MapError(f"{shown}: byte {error.start + 1} is not UTF-8: save the raster as plain text") from None
-    except (OSError, ValueError) as error:  # a folder, a pipe, no permission, a name that no file can have
+    except (OSError, ValueError) as error:  # a folder, a pipe, no permission, an impossible name
         reason = getattr(error, "strerror", None) or error
         raise MapError(f"'{shown}' cannot be read ({reason}): give the path of a readable text file") from None
-    if len(raw) > MAX_BYTES:
-        raise MapError(f"{shown} is over {MAX_BYTES:,} bytes, too much for 65,535 cells: make the cells wider")
+    if len(raw) > MAX_RASTER_BYTES:
+        raise MapError(f"{shown} is over {MAX_RASTER_BYTES:,} bytes, too much for 65,535 cells: make the cells wider")
     return text
 
 
 def parse_raster(text: str, name: str = "raster", where: str = "raster", *, keep_blocked: bool = True) -> RoadMap:
-    """A map from the text of a raster, as `parse_text` describes it. Raises MapError.
+    """Return the map of a raster's text, in the form of `parse_text`. Raises MapError.
 
-    `name` is used when no header gives one; `where` is what messages call the text.
+    `name`: used when the header has none. `where`: the name of the text in errors.
     """
     where = regular.plain(where)
     header, rows = parse_text(text, where)
@@ -205,7 +205,7 @@ def parse_raster(text: str, name: str = "raster", where: str = "raster", *, keep
     return RoadMap(
         name=header["name"],
         grid=Grid(len(rows), len(rows[0])),
-        cell_m=float(header.get("cell_m", USUAL_CELL_M)),
+        cell_m=float(header.get("cell_m", DEFAULT_CELL_M)),
         road=cells == ROAD,
         blocked=(cells == BLOCKED) & keep_blocked,
         attribution=header.get("attribution", ""),
@@ -214,7 +214,7 @@ def parse_raster(text: str, name: str = "raster", where: str = "raster", *, keep
 
 
 def _from_document(doc: dict[str, Any], roads: str, obstacles: str) -> RoadMap:
-    """A map from a document of `maps/`; these ship with the package and are tested, so they are trusted here."""
+    """Return the map of a document of `maps/`. These ship with the package and are tested, so nothing is checked."""
     grid = Grid(doc["rows"], doc["cols"])
     mapping = doc["mapping"]
     origin = tuple(doc["window"]["origin_lonlat"])
@@ -247,10 +247,10 @@ def _cells(grid: Grid, obstacles: list[dict[str, Any]]) -> NDArray[np.bool_]:
 
 
 def _rate(rates: dict[str, Any], name: str, road: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Shape (K,): scaled to mean 1 over the road cells of this preset, 0 elsewhere.
+    """Return rates with mean 1 over the road cells of this preset, 0 elsewhere; shape (K,).
 
-    A road cell without a count (collectors, a quiet block of York St) gets the file's `uncounted` value, the lower
-    quartile of minor arterials: a road cell is never left without events only because nobody counted there.
+    A road cell without a traffic count (collectors, a block of York St) gets the file's `uncounted` value, the lower
+    quartile of minor arterials. So every road cell has events.
     """
     table = np.array(rates[name], np.float64).ravel()  # null becomes NaN
     values = np.where(np.isnan(table), rates["uncounted"][name], table) * road
@@ -258,9 +258,9 @@ def _rate(rates: dict[str, Any], name: str, road: NDArray[np.bool_]) -> NDArray[
 
 
 def check(road_map: RoadMap) -> list[str]:
-    """What a user should look at before flying this map, a sentence each; empty for a map in good order.
+    """Return what is unusual about a map, one sentence each; empty when nothing is.
 
-    Looks for several road components, dead ends, road cells that cannot be flown to from the largest piece of open
+    Reports several road components, dead ends, road cells that cannot be reached from the largest component of open
     cells, and a share of road below 2 % or above 60 % (a wrong cell size, or dual carriageways two cells wide).
     """
     grid, road = road_map.grid, road_map.road
@@ -269,25 +269,25 @@ def check(road_map: RoadMap) -> list[str]:
     if len(pieces) > 1:
         sizes = ", ".join(str(p.size) for p in pieces[:5]) + (", ..." if len(pieces) > 5 else "")
         findings.append(f"the road has {len(pieces)} components of {sizes} cells: join them, or keep the largest")
-    if ends := _places(grid, np.flatnonzero(road & (_road_neighbours(grid, road) < 2))):
+    if ends := _listed(grid, np.flatnonzero(road & (_road_neighbours(grid, road) < 2))):
         findings.append(f"road cells that are dead ends, (row, col): {ends}")
     apart = road.copy()
     apart[components(grid, ~road_map.blocked)[0]] = False
-    if cut_off := _places(grid, np.flatnonzero(apart)):
+    if cut_off := _listed(grid, np.flatnonzero(apart)):
         findings.append(f"road cells that blocked cells cut off, (row, col): {cut_off}")
     share = float(road.mean())
     if not 0.02 <= share <= 0.6:
-        findings.append(f"{share:.1%} of the cells are road, where 2 % to 60 % is usual: look at the cell size")
+        findings.append(f"{share:.1%} of the cells are road, where 2 % to 60 % is usual: check the cell size")
     return findings
 
 
 def _road_neighbours(grid: Grid, road: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Shape (K,): how many of the 8 neighbours of each cell are road."""
+    """Return how many of the 8 neighbours of each cell are road; shape (K,), int64."""
     targets = grid.targets[:, :STAY]
     return np.asarray((road[targets] & (targets != OFF_GRID)).sum(axis=1))
 
 
-def _places(grid: Grid, cells: NDArray[np.int64]) -> str:
-    """The first five cells as "(row, col)", and how many more there are."""
+def _listed(grid: Grid, cells: NDArray[np.int64]) -> str:
+    """Return the first five cells as "(row, col)", and the number of the others."""
     shown = ", ".join(f"({k // grid.cols}, {k % grid.cols})" for k in cells[:5].tolist())
     return shown + (f" and {cells.size - 5} more" if cells.size > 5 else "")

@@ -1,4 +1,4 @@
-"""Text that comes from elsewhere: made fit to be shown, and compared with the names that exist."""
+"""Make foreign text safe to print: names of maps, paths, and the content of damaged or foreign logs."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterable
 
 
 def printable(text: object) -> str:
-    """The text on one line, with every character that is not one to read written as an escape.
+    """Return the text on one line, with every character that is not printable as an escape sequence.
 
-    Escape sequences move the cursor, a newline forges a line of ours, marks of direction turn words round, and bytes
-    of a name that are no UTF-8 (surrogates) can be neither encoded nor logged.
+    Escape sequences move the cursor, a newline imitates a line of Overfly, and marks of direction reorder words. Bytes
+    of a name that are not UTF-8 (surrogates) can be neither encoded nor logged.
     """
     words = str(text)
     return words if words.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in words)

@@ -1,12 +1,12 @@
-"""The uncertainty of both scenarios (eqs. 1-4), its updates (Sec. II-D), and the average that is minimised (eq. 6).
+"""Compute the uncertainty of both scenarios (eqs. 1-4), its updates (Sec. II-D), and the bound of its mean (eq. 6).
 
 Scenario II keeps, for every cell, the tick of its last visit `tau_k` and computes
 
     u_k(t) = 1 - exp(-alpha_k (t - tau_k))                                         (eq. 3)
 
-An initial map that is not "all visited at t = 0" is carried by one factor a cell, `s_k = 1 - u_k(0)`, in force until
-the first visit: u_k(t) = 1 - s_k exp(-alpha_k t). Values come from a table of exp(-alpha n), so that
-every process, and the replay that rebuilds what a UAV saw, gets the same bits.
+An initial map that is not visited at t = 0 has one factor per cell, `s_k = 1 - u_k(0)`, which applies until the first
+visit: u_k(t) = 1 - s_k exp(-alpha_k t). Values come from a table of exp(-alpha n), so that all processes, and the
+replay memory that rebuilds observations, get the same bits.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 
 
 class UncertaintyLaw:
-    """Eq. (3) for a fixed set of cells and rates; holds tables, no state.
+    """Compute eq. (3) for a fixed set of cells and rates. Holds tables, no state.
 
-    Arguments: `alpha`, shape (K,), events a tick in each cell (0 where nothing is monitored); `ticks`, the longest age
-    that is asked for. All arrays are over the R monitored cells, in ascending order of k.
+    `alpha`: events per tick in each cell, shape (K,), 0 where a cell is not monitored. `ticks`: the longest age. All
+    other arrays are over the R monitored cells, in ascending order of k.
     """
 
     def __init__(self, alpha: NDArray[np.float64], ticks: int) -> None:
         self.cells = np.flatnonzero(alpha > 0).astype(np.int32)
-        """Shape (R,): the monitored cells k."""
+        """The monitored cells k; shape (R,), int32."""
         self.index = np.full(alpha.size, -1, np.int32)
-        """Shape (K,): where cell k stands in `cells`, or -1."""
+        """The index of cell k in `cells`, or -1; shape (K,), int32."""
         self.index[self.cells] = np.arange(self.cells.size)
         self.index_list = [int(i) for i in self.index]
         self.q = np.exp(-alpha[self.cells])
-        """Shape (R,): q_k = exp(-alpha_k), what is left of certainty after one tick."""
+        """q_k = exp(-alpha_k), the certainty that is left after one tick; shape (R,)."""
         rates, rate_of = np.unique(alpha[self.cells], return_inverse=True)
         self._decay = np.exp(-rates[:, None] * np.arange(ticks + 1)[None, :]).ravel()
         self._offset = rate_of.astype(np.int64) * (ticks + 1)
@@ -41,9 +41,9 @@ class UncertaintyLaw:
     def values(
         self, last_visit: NDArray[np.uint16], t: int | NDArray[np.int64], s: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """u_k(t) from the ticks of the last visits. Shapes (..., R) and () or (..., 1) -> (..., R), float64.
+        """Return u_k(t) from the ticks of the last visits. Shapes (..., R) and () or (..., 1) -> (..., R), float64.
 
-        `s`, shape (..., R): the initial map's factors 1 - u_k(0), for cells with `last_visit` 0, "not since the start".
+        `s`: the initial map's factors 1 - u_k(0), shape (..., R), for cells with `last_visit` 0, not visited since.
         """
         left = self._decay.take(self._offset + t - last_visit)
         if s is not None:
@@ -53,15 +53,15 @@ class UncertaintyLaw:
     def singles(
         self, last_visit: NDArray[np.uint16], t: NDArray[np.int64], s: NDArray[np.float64] | None = None
     ) -> NDArray[np.float32]:
-        """`values` rounded to float32, in a tenth of the time where there is no `s`."""
+        """Return `values` rounded to float32; without `s`, in a tenth of the time."""
         if s is not None:
             return self.values(last_visit, t, s).astype(np.float32)
         age = np.subtract(t.astype(np.uint16), last_visit, dtype=np.uint16)
-        # Every age is in the table; where NumPy has to check that, it takes half as long again.
+        # Every age is in the table. With a check of that, NumPy takes 1.5 times as long.
         return self._single.take(age if self._rows.ndim == 0 else age + self._rows, mode="clip")
 
     def value(self, i: int, last_visit: int, t: int, s: NDArray[np.float64] | None = None) -> float:
-        """u of the one cell `cells[i]`; the same bits as `values`."""
+        """Return u of the cell `cells[i]`; the same bits as `values`."""
         left: float = self._decay.item(self._offsets[i] + t - last_visit)
         if s is not None and last_visit == 0:
             left = float(s[i]) * left
@@ -69,9 +69,9 @@ class UncertaintyLaw:
 
 
 def merge(a: NDArray[np.uint16], b: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """The one law of local and global update: the latest visit wins (Sec. II-D).
+    """Merge two maps of last visits: the later visit counts (Sec. II-D). Local and global updates both use it.
 
-    Commutative, associative and idempotent, so late, doubled or reordered records cannot corrupt a map.
+    It is commutative, associative and idempotent, so late, repeated or reordered records cannot corrupt a map.
     """
     return np.maximum(a, b)
 
@@ -79,9 +79,9 @@ def merge(a: NDArray[np.uint16], b: NDArray[np.uint16]) -> NDArray[np.uint16]:
 def step_events(
     active: NDArray[np.bool_], visited: list[int], arrivals: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Scenario I, one slot, in the paper's order: cells visited in [t, t+1) are cleared, then its new events appear.
+    """Advance scenario I by one tick, in the paper's order: clear the cells visited in [t, t+1), then add new events.
 
-    Returns e(t+1), shape (K,), and the cells whose event is new in it. An arrival at an active cell adds nothing.
+    Returns e(t+1), shape (K,), and the cells of its new events. An arrival at an active cell has no effect.
     """
     cleared = active.copy()
     cleared[visited] = False
@@ -91,38 +91,38 @@ def step_events(
 
 
 def arrival_probability(alpha: NDArray[np.float64]) -> NDArray[np.float64]:
-    """P(at least one Poisson arrival in a tick) = 1 - exp(-alpha_k), so that both scenarios share alpha."""
+    """Return P(at least one Poisson arrival in a tick) = 1 - exp(-alpha_k). So both scenarios share alpha."""
     return -np.expm1(-alpha)
 
 
-ROUNDING = 1e-12
-"""A bound below this share of the rates is 0: what is left of it is rounding, and nothing can be compared with it."""
+MIN_BOUND_SHARE = 1e-12
+"""A bound below this share of the sum of the rates is only rounding, and counts as 0."""
 
 
 def lower_bound(alpha: NDArray[np.float64], uavs: int, ticks: int) -> float:
-    """No team of N UAVs can have a smaller eq. (6) in scenario II, from a map all visited.
+    """Return a lower bound of eq. (6) for N UAVs in scenario II, from a map that starts visited.
 
-    Returns the sum over cells, averaged over ticks 1..T. For uneven rates, the N T visits go where they save most.
-    Where UAVs stand, and that one visits one cell a tick, is ignored.
+    A sum over cells, averaged over ticks 1..T. For uneven rates, the N T visits go where they save most. The bound
+    ignores positions, and that a UAV visits one cell per tick.
     """
     rates = alpha[alpha > 0]
     relaxed = _best_spread(rates, uavs * ticks, ticks)
     bound = max(relaxed, _youngest(rates, uavs, ticks)) if np.ptp(rates) == 0 else relaxed
-    return bound if bound > ROUNDING * rates.sum() else 0.0
+    return bound if bound > MIN_BOUND_SHARE * rates.sum() else 0.0
 
 
 def _youngest(rates: NDArray[np.float64], uavs: int, ticks: int) -> float:
-    """Equal rates: at each tick at most N cells have age 0, at most N have age 1, and so on; the rest have age t."""
+    """Return the bound for equal rates: at most N cells have age 0, N have age 1, and so on; the others have age t."""
     ages = np.arange(rates.size) // max(uavs, 1)
     sums = (-np.expm1(-rates * np.minimum(ages, t)).sum() for t in range(1, ticks + 1))
     return float(sum(sums)) / ticks
 
 
 def _best_spread(rates: NDArray[np.float64], visits: int, ticks: int) -> float:
-    """Any rates: `visits` visits in all, each cell's evenly spaced, spent where they save most.
+    """Return the bound for any rates: `visits` visits, evenly spaced in each cell, spent where they save most.
 
-    A cell with n visits has n + 1 stretches of T - n unvisited ticks together. What it costs is convex in n, so taking
-    the largest savings first is the optimum of this relaxed problem.
+    A cell with n visits has n + 1 intervals of T - n unvisited ticks together. Its cost is convex in n, so taking the
+    largest savings first is optimal for this relaxed problem.
     """
     n = np.arange(ticks + 1)
     length, longer = np.divmod(ticks - n, n + 1)

@@ -1,4 +1,4 @@
-"""The world of a mission: its map, its rates, and what chance brings in each episode. Immutable, alike everywhere."""
+"""The world of a mission: its map, its rates, and the random draws of each episode. Immutable, the same everywhere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tmc.kernel.uncertainty import UncertaintyLaw, arrival_probability
 
 
 class World:
-    """`config` on `road_map` (loaded by name when it is not given); raises ConfigError where the two do not fit."""
+    """The settings `config` on `road_map`, by default loaded by its name; ConfigError where the two do not fit."""
 
     def __init__(self, config: Config, road_map: RoadMap | None = None) -> None:
         self.config = config
@@ -25,12 +25,12 @@ class World:
         self.grid = self.map.grid
         self.law = UncertaintyLaw(self.alpha, config.training.ticks)
         self.moves = self._moves()
-        """For each cell and action, as the map has it: the cell that the UAV is on afterwards, and what blocks it."""
+        """By cell and action: the cell that the UAV is on afterwards, and what blocks it, by the map alone."""
         self._check()
 
     @cached_property
     def alpha(self) -> NDArray[np.float64]:
-        """Shape (K,): events a tick in each cell; 0 where nothing can be visited."""
+        """Events per tick in each cell, 0 on blocked cells; shape (K,)."""
         world = self.config.world
         if world.rates not in self.map.rates:
             known = ", ".join(sorted(self.map.rates))
@@ -40,7 +40,7 @@ class World:
 
     @cached_property
     def start_cells(self) -> NDArray[np.int64]:
-        """Cells that a UAV may start on."""
+        """The cells on which a UAV may start."""
         road = self.config.world.start == "road"
         return np.flatnonzero(~self.map.blocked & (self.map.road if road else True))
 
@@ -74,13 +74,13 @@ class World:
             raise ConfigError(f"no cell of {self.map.name} is monitored: every rate is 0")
 
     def starts(self, episode: int) -> list[int]:
-        """The N distinct cells that the team starts an episode on (Algorithm 1)."""
+        """Return the N distinct cells on which the team starts an episode (Algorithm 1)."""
         n = self.config.team.size
         u = uniforms(self.config.training.seed, Stream.STARTS, n, episode=episode)
         return distinct(u, self.start_cells, n)
 
     def initial_factor(self, episode: int) -> NDArray[np.float64] | None:
-        """Shape (R,): s_k = 1 - u_k(0), uniform in (0, 1], 1 under a UAV; None when all cells are visited at t = 0."""
+        """Return s_k = 1 - u_k(0), uniform in (0, 1], 1 under a UAV, shape (R,); None when the map starts visited."""
         if self.config.world.initial_map == "visited":
             return None
         u = uniforms(self.config.training.seed, Stream.AGES, self.grid.size, episode=episode)
@@ -92,18 +92,18 @@ class World:
         return arrival_probability(self.alpha)
 
     def arrivals(self, episode: int, tick: int) -> NDArray[np.bool_]:
-        """Shape (K,): cells where an event arrives in [tick - 1, tick) (scenario I)."""
+        """Return True for cells where an event arrives in [tick - 1, tick) (scenario I); shape (K,), bool."""
         u = uniforms(self.config.training.seed, Stream.EVENTS, self.grid.size, episode=episode, tick=tick)
         return np.asarray(u < self._arrival)
 
     def explorations(self, episode: int, uav: int) -> NDArray[np.float64]:
-        """Shape (T_ep, 2): for each tick, the draw against epsilon and the draw that chooses an action."""
+        """Return for each tick the draw against epsilon and the draw that chooses an action; shape (T_ep, 2)."""
         ticks = self.config.training.ticks
         u = uniforms(self.config.training.seed, Stream.EXPLORATION, 2 * ticks, episode=episode, uav=uav)
         return u.reshape(ticks, 2)
 
 
 def world_of_run(config: Config, folder: Path) -> World:
-    """The world of a run in `folder`, with the map that lies there, where a user's map was flown over."""
+    """Return the world of a run in `folder`, with the folder's copy of a user's map."""
     world = config.world
     return World(config, map_of_run(folder, world.map, world.roads, world.obstacles))

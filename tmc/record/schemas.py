@@ -16,7 +16,7 @@ from tmc.record.errors import RecordError
 
 PACKAGE = "overfly"
 
-# Each field as "type name"; "*" marks a repeated one. See overfly.proto for what the fields mean.
+# Each field is "type name"; "*" marks a repeated one. overfly.proto describes the fields.
 TYPES: dict[str, str] = {
     "FlightRecord": "uint32 uav, uint64 incarnation, uint64 sequence, uint32 episode, uint32 first, uint32 tick, "
     "uint64 version, uint64 policy, uint32* cells, uint32* actions, uint32* blocks, float* rewards, "

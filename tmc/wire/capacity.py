@@ -1,4 +1,4 @@
-"""What a mission will send against what the rules of the messages allow: asked before anything of it starts."""
+"""Check before a mission starts that its messages fit the limits of their fields."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Need:
-    """How much a mission puts into a field of a message at most, of what; and what makes it so."""
+    """The largest size of a field in a mission: `size` in `unit`, its cause, and the fix."""
 
     message: type[m.Message]
     field: str
     size: int
     unit: str
     cause: str
-    mend: str
+    fix: str
 
     @property
     def limit(self) -> int:
-        """How much the field takes."""
+        """The largest size that the field accepts."""
         return int(fields.rules(self.message)[self.field].high)
 
 
 def needs(world: World, *, learning: bool) -> Iterator[Need]:
-    """The fields of which a mission's settings and map decide how large they get.
+    """Yield the fields whose size depends on settings and map.
 
-    Sightings of a record are among the limits of the settings (`tmc.kernel.config`), since they concern every mission.
+    Sightings of a record are checked with the settings (`tmc.kernel.config`), since they occur in every mission.
     """
     config, cells, ticks = world.config, world.law.cells.size, world.config.training.ticks + 1
     texts = {key: len(json.dumps(value)) for key, value in flat(config).items()}
@@ -55,7 +55,7 @@ def needs(world: World, *, learning: bool) -> Iterator[Need]:
         (m.Map, "active"),
     )
     for message, name in of_cells:
-        yield Need(message, name, cells, "cells", f"what is monitored of {world.map.name}", "make the cells wider")
+        yield Need(message, name, cells, "cells", f"the monitored cells of {world.map.name}", "make the cells wider")
     of_ticks: tuple[tuple[type[m.Message], str], ...] = ((m.Begin, "track"), (m.Record, "cells"), (m.Beacon, "cells"))
     for message, name in of_ticks:
         yield Need(message, name, ticks, "ticks", "an episode with its start", "lower training.ticks")
@@ -64,7 +64,7 @@ def needs(world: World, *, learning: bool) -> Iterator[Need]:
 
 
 def _of_learning(world: World) -> Iterator[Need]:
-    """The fields that only a learner and its TMC fill."""
+    """Yield the fields of messages between learner and TMC."""
     config, batch, network = world.config, world.config.dqn.batch_size, world.config.network
     size = policy_bytes(config, view_shape(config, world.grid))
     cause = f"a policy with network.dense = {network.dense} and network.channels = {list(network.channels)[:8]}"
@@ -77,15 +77,15 @@ def _of_learning(world: World) -> Iterator[Need]:
 
 
 def check(world: World, *, learning: bool) -> None:
-    """Raise ConfigError where a mission would send more than a message takes."""
+    """Raise ConfigError when a mission would send more than a message can hold."""
     for need in needs(world, learning=learning):
         if need.size > need.limit:
             more = f"{need.size:,} {need.unit}, and {need.message.__name__}.{need.field} takes {need.limit:,}"
-            raise ConfigError(f"{need.cause} comes to {more}: {need.mend}")
+            raise ConfigError(f"{need.cause} comes to {more}: {need.fix}")
 
 
 def check_policy(size: int) -> None:
-    """Raise PolicyError for a policy file of so many bytes that no message takes it."""
+    """Raise PolicyError when a policy file of `size` bytes does not fit a message."""
     limit = int(fields.rules(m.Policy)["model"].high)
     if size > limit:
         raise PolicyError(f"it has {size:,} bytes, and a policy may have {limit:,}: train a smaller network")

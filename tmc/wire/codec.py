@@ -1,7 +1,7 @@
-"""Messages to frames and back. The first frame is a msgpack map; large fields follow as frames of their own.
+"""Encode messages as frames, and decode them. The first frame is a msgpack map; each large field has its own frame.
 
-What arrives is untrusted: sizes are limited before anything is unpacked, every field is checked, and whatever is wrong
-ends in a CodecError with the code of the error reply. Nothing else can come out of `decode`.
+Frames are untrusted. Sizes are limited before anything is unpacked, and every field is checked. `decode` returns a
+valid message or raises CodecError, with the code of the error reply.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import numpy as np
 from tmc.wire import fields
 from tmc.wire.messages import MESSAGES, PROTOCOL, Message
 
-HEADER_LIMIT = 5 * 1024 * 1024
-"""Largest first frame, bytes: a flight record of the longest episode fits."""
+HEADER_LIMIT_BYTES = 5 * 1024 * 1024
+"""Largest first frame. A flight record of the longest episode fits."""
 _TYPES = {cls.__name__: cls for cls in MESSAGES}
 _FRAMED = ("tensor", "bytes")
 
 
 class CodecError(ValueError):
-    """Frames that are no valid message; `code` is one of the codes of `Error`."""
+    """Frames are not a valid message. `code` is one of the codes of `Error`."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -30,7 +30,7 @@ class CodecError(ValueError):
 
 
 def encode(message: Message) -> list[Any]:
-    """The frames of a message: bytes, and contiguous arrays that ZeroMQ can send without a copy."""
+    """Return the frames of a message: bytes, and contiguous arrays, which ZeroMQ sends without a copy."""
     header: dict[str, Any] = {"type": type(message).__name__, "v": PROTOCOL}
     frames: list[Any] = []
     for name, rule in fields.rules(type(message)).items():
@@ -48,7 +48,7 @@ def encode(message: Message) -> list[Any]:
 
 
 def decode(frames: Sequence[Any]) -> Message:
-    """The message in these frames (bytes or buffers); raises CodecError."""
+    """Return the message in these frames (bytes or buffers). Raises CodecError."""
     header = _header(frames)
     cls = _message_class(header)
     values: dict[str, Any] = {}
@@ -74,38 +74,38 @@ def decode(frames: Sequence[Any]) -> Message:
 
 
 def _header(frames: Sequence[Any]) -> dict[str, Any]:
-    if not frames or len(frames[0]) > HEADER_LIMIT:
-        raise CodecError("malformed", f"the first frame must have 1 to {HEADER_LIMIT} bytes")
+    if not frames or len(frames[0]) > HEADER_LIMIT_BYTES:
+        raise CodecError("malformed", f"the first frame must have 1 to {HEADER_LIMIT_BYTES} bytes")
     try:
         header = msgpack.unpackb(
             frames[0], strict_map_key=True, max_map_len=64, max_array_len=8, max_ext_len=0,
             object_pairs_hook=_flat_map, list_hook=_flat_list,
         )  # fmt: skip
-    except Exception:  # msgpack raises a dozen kinds, some of them bare ValueError or RecursionError
-        raise CodecError("malformed", "the first frame is no msgpack map within the limits") from None
+    except Exception:  # msgpack raises many types, ValueError and RecursionError among them
+        raise CodecError("malformed", "the first frame is not a msgpack map within the limits") from None
     if not isinstance(header, dict) or not all(isinstance(k, str) for k in header):
-        raise CodecError("malformed", "the first frame is no msgpack map with string keys")
+        raise CodecError("malformed", "the first frame is not a msgpack map with string keys")
     return header
 
 
 def _flat_map(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
-    """The header; refuses a map inside it, since a megabyte of nested empty maps unpacks to a hundred."""
+    """Return the header; refuse a map inside it, since nested empty maps unpack to a hundred times their size."""
     if any(isinstance(value, dict) for _, value in pairs):
         raise ValueError("a map inside the header")
     return dict(pairs)
 
 
 def _flat_list(items: list[Any]) -> list[Any]:
-    """A shape; refuses anything but ints in it, for the same reason."""
+    """Return a shape; refuse anything but ints in it, for the same reason."""
     if any(type(item) is not int for item in items):
-        raise ValueError("a list of something else than ints")
+        raise ValueError("a list of values other than ints")
     return items
 
 
 def _message_class(header: dict[str, Any]) -> type[Message]:
     version, name = header.pop("v", None), header.pop("type", None)
     if type(version) is not int or version != PROTOCOL:
-        raise CodecError("version", f"protocol version {str(version)[:20]!r} is foreign: use version {PROTOCOL}")
+        raise CodecError("version", f"protocol version {str(version)[:20]!r} is not supported: use version {PROTOCOL}")
     if not isinstance(name, str) or name not in _TYPES:
         raise CodecError("unknown", f"there is no message type {str(name)[:40]!r}")
     return _TYPES[name]

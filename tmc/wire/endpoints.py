@@ -1,7 +1,7 @@
-"""Where a socket binds or connects: `tcp://HOST:PORT` or `ipc://PATH`, looked at before ZeroMQ sees it.
+"""Check an endpoint, `tcp://HOST:PORT` or `ipc://PATH`, before ZeroMQ uses it.
 
-ZeroMQ wraps a port of 70000 round to 4464, waits for ever for a host that does not exist, and takes a path away from
-its owner. So every endpoint of a command line or of a plan comes through here.
+ZeroMQ turns port 70000 into 4464, waits for ever for a host that does not exist, and takes over the path of another
+process. So every endpoint of a command line or of a plan is checked here.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from pathlib import Path
 from tmc.kernel.errors import OverflyError
 from tmc.kernel.text import printable
 
-LONGEST_PATH = 107 if sys.platform == "linux" else 103
-"""Bytes of a socket's path: `sun_path` of unix(7), without the byte that ends it."""
+MAX_PATH_BYTES = 107 if sys.platform == "linux" else 103
+"""Longest path of a socket: `sun_path` of unix(7), without the final zero byte."""
 LAST_PORT = 65_535
-FEED = ".feed"
-"""What the learner's path has after that of the UAVs."""
+LEARNER_SUFFIX = ".learner"
+"""Appended to the path of the UAVs' socket for the learner's."""
 _TCP = re.compile(r"tcp://(?:\[(?P<ipv6>[^][/]+)\]|(?P<host>[^][/:;\s]+)):(?P<port>[0-9]{1,5})")
-_HOW = "write tcp://HOST:PORT or ipc://PATH"
+_FIX = "write tcp://HOST:PORT or ipc://PATH"
 
 
 class EndpointError(OverflyError, ValueError):
-    """An endpoint that cannot be used: one sentence with the fix."""
+    """An endpoint cannot be used. The text is one sentence with the fix."""
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """`host` and `port`, or `path`. `ipv6`: the host is an IPv6 address, or a name that has no other."""
+    """`host` and `port`, or `path`. `ipv6`: the host is an IPv6 address, or a name with IPv6 addresses only."""
 
     host: str = ""
     port: int = 0
@@ -47,40 +47,40 @@ class Endpoint:
 
 
 def parse(text: str) -> Endpoint:
-    """The parts of an endpoint, of which it is not said yet whether they exist here; raises EndpointError."""
+    """Parse an endpoint, without checking that host or path exist. Raises EndpointError."""
     wrong = f"'{printable(text)[:100]}' is not an endpoint"
     if not text.isprintable():
-        raise EndpointError(f"{wrong}, it holds a control character: {_HOW}")
+        raise EndpointError(f"{wrong}, it holds a control character: {_FIX}")
     if path := text.removeprefix("ipc://") if text.startswith("ipc://") else "":
         return Endpoint(path=path)
     found = _TCP.fullmatch(text)
     if found is None:
         if text.startswith("tcp://") and text.count(":") > 2 and "[" not in text:
             raise EndpointError(f"{wrong}: write an IPv6 address in brackets, tcp://[ADDRESS]:PORT")
-        raise EndpointError(f"{wrong}: {_HOW}")
+        raise EndpointError(f"{wrong}: {_FIX}")
     port = int(found["port"])
     if not 0 < port <= LAST_PORT:
-        raise EndpointError(f"{wrong}, it has no port from 1 to {LAST_PORT}: {_HOW}")
+        raise EndpointError(f"{wrong}, it has no port from 1 to {LAST_PORT}: {_FIX}")
     if found["ipv6"]:
         try:
             ipaddress.IPv6Address(found["ipv6"])
         except ValueError:
-            raise EndpointError(f"{wrong}, what stands in its brackets is not an IPv6 address: {_HOW}") from None
+            raise EndpointError(f"{wrong}, its brackets do not hold an IPv6 address: {_FIX}") from None
     return Endpoint(found["ipv6"] or found["host"], port, ipv6=bool(found["ipv6"]))
 
 
 def learner_endpoint(sync: str) -> str:
-    """The learner's endpoint, beside that of the UAVs: the next tcp port, or the same ipc path with `.sample_queue`."""
+    """Return the learner's endpoint for that of the UAVs: the next tcp port, or the ipc path with LEARNER_SUFFIX."""
     endpoint = parse(sync)
     if endpoint.path:
-        return str(replace(endpoint, path=endpoint.path + FEED))
+        return str(replace(endpoint, path=endpoint.path + LEARNER_SUFFIX))
     if endpoint.port == LAST_PORT:
-        raise EndpointError(f"'{sync}' is not an endpoint of a TMC, whose learner needs the next port: {_HOW}")
+        raise EndpointError(f"'{sync}' is not an endpoint of a TMC, whose learner needs the next port: {_FIX}")
     return str(replace(endpoint, port=endpoint.port + 1))
 
 
 def to_bind(text: str) -> Endpoint:
-    """The endpoint to bind, with the host's address in place of its name; EndpointError when it cannot be bound."""
+    """Return the endpoint to bind, with the host's address instead of its name. Raises EndpointError."""
     endpoint = _parsed("bind", text)
     if endpoint.path:
         return _checked("bind", endpoint, _wrong_to_bind)
@@ -91,9 +91,9 @@ def to_bind(text: str) -> Endpoint:
 
 
 def to_connect(text: str) -> Endpoint:
-    """The endpoint to connect to; EndpointError when nothing can ever listen there.
+    """Return the endpoint to connect to; EndpointError when nothing can listen there.
 
-    A name stays one, since ZeroMQ asks for its address again whenever it connects again.
+    The name of a host is kept, since ZeroMQ resolves it again at each new connection.
     """
     endpoint = _parsed("connect to", text)
     if endpoint.path:
@@ -104,7 +104,7 @@ def to_connect(text: str) -> Endpoint:
 
 
 def listens(text: str) -> bool:
-    """True when a process takes connections at an endpoint now, whatever it is."""
+    """Return True when any process accepts connections at an endpoint now."""
     try:
         return _listens(parse(text))
     except EndpointError:
@@ -130,27 +130,27 @@ def _parsed(what: str, text: str) -> Endpoint:
 
 
 def _abstract(endpoint: Endpoint) -> bool:
-    """Whether the path is a name of Linux's abstract namespace, which no folder holds."""
+    """Return True for a name of Linux's abstract namespace, which is not in any folder."""
     return endpoint.path.startswith("@")
 
 
 def _checked(what: str, endpoint: Endpoint, wrong: Callable[[Endpoint, Path], str]) -> Endpoint:
-    """The endpoint, whose path is one that a socket can have here."""
+    """Return the endpoint; EndpointError when its path cannot be that of a socket here."""
     path, size = Path(endpoint.path), len(os.fsencode(endpoint.path))
-    if size > LONGEST_PATH:
-        why = f"its path has {size} bytes, and a socket's may have {LONGEST_PATH}; choose a shorter one"
+    if size > MAX_PATH_BYTES:
+        why = f"its path has {size} bytes, and a socket's may have {MAX_PATH_BYTES}; choose a shorter one"
     else:
         try:
-            why = "" if _abstract(endpoint) else _wrong_anyhow(endpoint, path)
+            why = "" if _abstract(endpoint) else _wrong_path(endpoint, path)
             why = why or wrong(endpoint, path)
-        except OSError as error:  # a folder that may not be looked into
+        except OSError as error:  # a folder that must not be read
             why = f"{error.strerror}; choose another path"
     if why:
         raise EndpointError(f"cannot {what} {endpoint}: {why}")
     return endpoint
 
 
-def _wrong_anyhow(endpoint: Endpoint, path: Path) -> str:
+def _wrong_path(endpoint: Endpoint, path: Path) -> str:
     if not path.parent.is_dir():
         return f"there is no folder {path.parent}; make it, or choose another path"
     if endpoint.path == "*" or (path.exists() and not path.is_socket()):
@@ -172,7 +172,7 @@ def _wrong_to_connect(_: Endpoint, path: Path) -> str:
 
 
 def _resolved(what: str, text: str, endpoint: Endpoint) -> tuple[Endpoint, str]:
-    """The endpoint with its host's name as the system asks for it, and an address of it: an IPv4 one if it has one."""
+    """Return the endpoint with its host's name in ASCII, and an address of the host, IPv4 if it has one."""
     try:
         name = endpoint.host if endpoint.ipv6 else endpoint.host.encode("idna").decode("ascii")
         found = {

@@ -1,4 +1,4 @@
-"""Rules for message fields: kind, range and size, kept beside each field and checked whenever a message is made."""
+"""The rules of message fields: kind, range and size, beside each field, checked when a message is made."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-FRAME_LIMIT = 64 * 1024 * 1024
-"""Largest frame, bytes: what a socket takes (tmc.wire.sockets)."""
+FRAME_LIMIT_BYTES = 64 * 1024 * 1024
+"""Largest frame that a socket accepts (tmc.wire.sockets)."""
 SMALL_ARRAY_ENTRIES = 64
+"""Up to this size, plain Python checks an array faster than NumPy."""
 
 
 class FieldError(ValueError):
-    """A field breaks its rule; `code` is the code of the error reply."""
+    """A field violates its rule. `code` is the code of the error reply."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -49,45 +50,45 @@ def _field(rule: Rule, default: Any = dataclasses.MISSING, *, empty: bool = Fals
 
 
 def integer(low: int, high: int, default: Any = dataclasses.MISSING) -> Any:
-    """An int, never a bool, in low..high."""
+    """Declare an int, not a bool, in low..high."""
     return _field(Rule("int", low, high), default)
 
 
 def real(low: float, high: float) -> Any:
-    """A finite float in low..high."""
+    """Declare a finite float in low..high."""
     return _field(Rule("float", low, high))
 
 
 def choice(*names: str) -> Any:
-    """One of these strings."""
+    """Declare one of these strings."""
     return _field(Rule("str", 0, 64, choices=names))
 
 
 def text(longest: int) -> Any:
-    """A string of at most `longest` characters."""
+    """Declare a string of at most `longest` characters."""
     return _field(Rule("str", 0, longest))
 
 
 def blob(longest: int) -> Any:
-    """Bytes in a frame of their own."""
+    """Declare at most `longest` bytes, in their own frame."""
     return _field(Rule("bytes", 0, longest))
 
 
 def array(dtype: str, longest: int, *, empty: bool = False) -> Any:
-    """A short one-dimensional array, carried in the header as little-endian bytes; finite if it holds floats.
+    """Declare an array of one axis, with at most `longest` entries, in the header as little-endian bytes.
 
-    `empty`: whoever makes the message without it means an empty one.
+    Floats must be finite. `empty`: the default is an empty array.
     """
     return _field(Rule("array", 0, longest, dtype=dtype), empty=empty)
 
 
 def tensor(dtype: str, ndim: int, *, empty: bool = False) -> Any:
-    """A large array in a frame of its own, so that neither side copies it. `empty`, of one axis only: as in `array`."""
-    return _field(Rule("tensor", 0, FRAME_LIMIT // np.dtype(dtype).itemsize, dtype=dtype, ndim=ndim), empty=empty)
+    """Declare a large array in its own frame, which neither side copies. `empty`: as in `array`; for one axis only."""
+    return _field(Rule("tensor", 0, FRAME_LIMIT_BYTES // np.dtype(dtype).itemsize, dtype=dtype, ndim=ndim), empty=empty)
 
 
 def rules(cls: type) -> dict[str, Rule]:
-    """The rule of each field of a message class, in order."""
+    """Return the rule of each field of a message class, in order."""
     cached: dict[str, Rule] | None = cls.__dict__.get("_rules")
     if cached is None:
         cached = {f.name: f.metadata["rule"] for f in dataclasses.fields(cls)}
@@ -96,7 +97,7 @@ def rules(cls: type) -> dict[str, Rule]:
 
 
 def check(message: Any) -> None:
-    """Raise FieldError at the first field that breaks its rule."""
+    """Raise FieldError for the first field that violates its rule."""
     for name, rule in rules(type(message)).items():
         problem = _CHECKS[rule.kind](getattr(message, name), rule)
         if problem:
@@ -141,7 +142,7 @@ def _array(value: Any, rule: Rule) -> str:
 
 
 def _all_finite(value: Any) -> bool:
-    """A flight record has some ten entries, for which NumPy's calls cost more than plain Python."""
+    """Return True when all values are finite. A flight record has about ten, which plain Python checks faster."""
     return (
         all(map(math.isfinite, value.ravel().tolist()))
         if value.size <= SMALL_ARRAY_ENTRIES

@@ -1,9 +1,9 @@
-"""Every message of the protocol, and nothing else. Frozen, typed, and valid by construction: one that exists is intact.
+"""Every message of the protocol, and nothing else. Messages are frozen, typed, and valid by construction.
 
-`docs/reference/protocol.md` is the text to this table. UAV -> TMC: Hello, Record, Alive, PolicyRequest, Bye. TMC ->
-UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye. TMC ->
-learner: Welcome, Minibatch, Ack, End, Error. Anyone -> TMC: StatusRequest, answered by Status. UAV -> UAV, passed on by
-the TMC where the two share no memory: Beacon.
+`docs/reference/protocol.md` describes them. Senders and receivers: UAV -> TMC: Hello, Record, Alive, PolicyRequest,
+Bye. TMC -> UAV: Welcome, Begin, Map, Lost, Policy, End, Error. Learner -> TMC: Hello, SampleRequest, PolicyPush, Bye.
+TMC -> learner: Welcome, Minibatch, Ack, End, Error. Any client -> TMC: StatusRequest, answered by Status.
+UAV -> UAV, forwarded by the TMC where the two share no memory: Beacon.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tmc.kernel.config import MAX_SIGHTINGS
 from tmc.wire import fields as f
 
 PROTOCOL = 2
-"""Version of the protocol: a frame of any other version is refused."""
+"""Version of the protocol. Frames of any other version are refused."""
 
 Array = NDArray[Any]
 
@@ -33,7 +33,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """First word of a client. `uav` is -1 unless the role is "uav"; `incarnation` is new each time a process starts."""
+    """A client introduces itself. `uav`: -1 for the learner. `incarnation`: new each time that a process starts."""
 
     role: str = f.choice("uav", "learner")
     uav: int = f.integer(-1, 65_535)
@@ -43,10 +43,10 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class Welcome(Message):
-    """The mission that the TMC runs: all settings, the map's fingerprint, the run, the newest policy it has.
+    """The TMC's mission: all settings, the map's fingerprint, the run, and the newest policy version.
 
-    `tracks`: the table that the UAVs on the TMC's machine share; empty where they tell each other by beacon.
-    `sequence`: of the UAV's next record, as the TMC has it: what it has sent from there on, it sends again.
+    `tracks`: path of the table that the UAVs on the TMC's machine share; empty where they use beacons.
+    `sequence`: of the next record that the TMC expects of the UAV. The UAV resends its records from there on.
     """
 
     config: str = f.text(65_536)
@@ -59,10 +59,10 @@ class Welcome(Message):
 
 @dataclass(frozen=True)
 class Begin(Message):
-    """Fly from here: a new episode (`shipped` = -1, tick 0), or the flight of a lost process taken up again.
+    """Start of a flight: a new episode (`shipped` = -1, tick 0), or the resumed flight of a process that ended.
 
-    `track` (u16) is the UAV's own flight so far, a cell for each of the ticks 0..`tick`; `last_visit` (u16, one a
-    monitored cell) is what it knew of the map at `tick`; `lost`: the UAVs that the team goes on without.
+    `track` (u16): the UAV's own cells at ticks 0..`tick`. `last_visit` (u16 ticks, one per monitored cell): its own map
+    at `tick`. `lost`: the UAVs that are lost in this episode.
     """
 
     episode: int = f.integer(1, 2**31 - 1)
@@ -80,12 +80,14 @@ class Begin(Message):
 class Record(Message):
     """A flight record: what UAV `uav` did in ticks `first`..`tick` of an episode.
 
-    `cells` has one entry a tick. `actions`, `blocks` (why a move was blocked, 0: it was not) and `rewards` (as the UAV
-    reckons them by its own map) have one entry a move, so one less than `cells` when the record starts at tick 0.
-    `seen_tick`, `seen_cell`: peers sensed, one entry a sighting. `version`: the map that the UAV flew by. `values`:
-    where a policy flies and `replay.priority_exponent` is not 0, two entries a move, Q(o_t, a_t) and max_a Q(o_t, a)
-    over the actions that the UAV may choose; else empty. `sent`: the wall clock of the UAV when it made the record, ns
-    since 1970, for the log; 0 where there is no clock.
+    `cells`: one entry per tick.
+    `actions`, `blocks` (why a move was blocked, 0: not blocked), `rewards` (by the UAV's own map): one entry per move,
+    so one less than `cells` when the record starts at tick 0.
+    `seen_tick`, `seen_cell`: one entry per sighting of a peer.
+    `version`, `policy`: of the map and the policy with which the UAV flew.
+    `values`: two entries per move, Q(o_t, a_t) and max_a Q(o_t, a) over the allowed actions; empty unless a policy
+    flies and `replay.priority_exponent` is not 0.
+    `sent`: wall clock of the UAV when it made the record, ns since 1970, for the log; 0 without a clock.
     """
 
     uav: int = f.integer(0, 65_535)
@@ -110,8 +112,8 @@ class Record(Message):
 class Map(Message):
     """The TMC's answer to record `sequence`: the global map with every visit due by `tick`.
 
-    `acknowledged`: the UAV's records below this number are in the journal for good; it may forget them. `last_visit`
-    (u16 ticks, one a monitored cell) in scenario II; `active` (u16 cells with an event) in scenario I.
+    `acknowledged`: the UAV's records below this number are durable in the journal, so it may drop them. `last_visit`
+    (u16 ticks, one per monitored cell) in scenario II; `active` (u16 cells with an event) in scenario I.
     """
 
     episode: int = f.integer(1, 2**31 - 1)
@@ -126,8 +128,7 @@ class Map(Message):
 
 @dataclass(frozen=True)
 class Alive(Message):
-    """UAV `uav` is under way at `tick`, record `sequence` will be its next; it waits for the position of UAV `peer`, or
-    for none (-1)."""
+    """UAV `uav` flies at `tick`. `sequence`: of its next record. `peer`: the UAV for which it waits, -1 for none."""
 
     uav: int = f.integer(0, 65_535)
     incarnation: int = f.integer(0, 2**63 - 1)
@@ -138,7 +139,7 @@ class Alive(Message):
 
 @dataclass(frozen=True)
 class Lost(Message):
-    """UAV `uav` is lost in this episode: its last record ends at `tick` (-1: it has none). Wait for it no more."""
+    """UAV `uav` is lost in this episode. `tick`: end of its last record, -1 without one. Peers stop waiting for it."""
 
     episode: int = f.integer(1, 2**31 - 1)
     uav: int = f.integer(0, 65_535)
@@ -147,7 +148,7 @@ class Lost(Message):
 
 @dataclass(frozen=True)
 class PolicyRequest(Message):
-    """Send me the policy with this version."""
+    """A UAV asks for the policy with this version."""
 
     version: int = f.integer(0, 2**62)
 
@@ -162,10 +163,10 @@ class Policy(Message):
 
 @dataclass(frozen=True)
 class SampleRequest(Message):
-    """One minibatch, please. `request` comes back in the answer.
+    """The learner asks for a minibatch. `request` is repeated in the answer.
 
-    `index`, `errors`: the transitions of a minibatch that was just learned from, by number, and |Q - y| of each, which
-    is their priority from now on; both empty before the first one and where `replay.priority_exponent` is 0.
+    `index`, `errors`: numbers and TD errors |Q - y| of the transitions that the learner has just used, which become
+    their priorities; empty before the first minibatch, and where `replay.priority_exponent` is 0.
     `incarnation`: of the learner's process, as in `Hello`; 0 where there is only one.
     """
 
@@ -177,13 +178,13 @@ class SampleRequest(Message):
 
 @dataclass(frozen=True)
 class Minibatch(Message):
-    """`b` transitions (o_t, a_t, o_{t+n}, r), with what their observations are drawn from.
+    """`b` transitions (o_t, a_t, o_{t+n}, r), with the content of their observations.
 
     `cells` (2b,), `peers` (2b, P), `u` (2b, R): the fields of `tmc.kernel.observation.Views`, first those of o_t, then
     those of o_{t+n}. `reward`: the n-step sum, unscaled. `discount`: gamma^n. `allowed`: (b, 9), 0 for the actions that
-    a UAV in o_{t+n} would not choose. `episodes`: finished by its tick. `index`: a number of each transition, which no
-    other has before the TMC's next `Welcome`. `weight`: of each transition in the loss; empty where all count alike,
-    that is where `replay.priority_exponent` is 0.
+    a UAV in o_{t+n} would not choose. `episodes`: number of those that were finished at its tick. `index`: numbers of
+    the transitions, unique until the TMC's next `Welcome`. `weight`: of each transition in the loss; empty for equal
+    weights, where `replay.priority_exponent` is 0.
     """
 
     request: int = f.integer(0, 2**62)
@@ -202,7 +203,7 @@ class Minibatch(Message):
 
 @dataclass(frozen=True)
 class PolicyPush(Message):
-    """The learner's policy after `updates` updates; a version that is not newer is refused.
+    """The learner's policy after `updates` updates. A version that is not newer is refused.
 
     `sent`: as in `Record`; `incarnation`: as in `SampleRequest`.
     """
@@ -217,16 +218,16 @@ class PolicyPush(Message):
 
 @dataclass(frozen=True)
 class Ack(Message):
-    """The TMC has it."""
+    """The TMC has accepted the policy with this version."""
 
     version: int = f.integer(0, 2**62)
 
 
 @dataclass(frozen=True)
 class Beacon(Message):
-    """UAV `uav` stood on `cells` at `tick` and the ticks after it; the TMC passes it on to the UAVs in `to`.
+    """UAV `uav` was on `cells` at `tick` and the ticks after it. The TMC forwards it to the UAVs in `to`.
 
-    `ask` >= 0: and please tell me your own track from tick `ask` on. `cells` may be empty then.
+    `ask` >= 0: a request for the receivers' own tracks from tick `ask` on; `cells` may be empty then.
     """
 
     uav: int = f.integer(0, 65_535)
@@ -239,12 +240,12 @@ class Beacon(Message):
 
 @dataclass(frozen=True)
 class StatusRequest(Message):
-    """How far is the mission?"""
+    """A client asks for the progress of the mission."""
 
 
 @dataclass(frozen=True)
 class Status(Message):
-    """Progress of the mission. `phase`: gathering, flying, learning (the learner catches up) or done."""
+    """Progress of the mission. `phase`: gathering, flying, learning (the learner finishes its updates) or done."""
 
     phase: str = f.choice("gathering", "flying", "learning", "done")
     episode: int = f.integer(0, 2**31 - 1)
@@ -262,7 +263,7 @@ class Status(Message):
 
 @dataclass(frozen=True)
 class End(Message):
-    """The mission is over; leave. `acknowledged`: as in `Map`."""
+    """The mission is over: clients leave. `acknowledged`: as in `Map`."""
 
     reason: str = f.text(1024)
     acknowledged: int = f.integer(0, 2**62, default=0)
@@ -279,9 +280,9 @@ class Bye(Message):
 
 @dataclass(frozen=True)
 class Error(Message):
-    """What was wrong with your frame, and the mend. Nothing was changed by it.
+    """A frame was refused, and changed nothing. `text`: the cause and the fix.
 
-    `incarnation`: of the process that sent the frame, where it told: another one may have its name by now.
+    `incarnation`: of the process that sent the frame, where the frame had one; a later one may have the same name.
     """
 
     code: str = f.choice("malformed", "version", "unknown", "range", "state", "fenced", "refused")

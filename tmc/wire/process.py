@@ -1,4 +1,4 @@
-"""What every process does around its main loop: take over from its parent, note signals, end with a code that tells."""
+"""Start and end a process: streams, signals, the parent's death, and exit codes."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tmc.kernel.errors import OverflyError
 from tmc.kernel.text import printable
 
 DONE, FAILED, USAGE, FENCED, STOPPED = 0, 1, 2, 75, 143
-"""Exit codes: all well; failed; a user's mistake; replaced by a newer process of the same name; ended by a signal."""
+"""Exit codes: success; failure; a user's mistake; replaced by a newer process of the same name; ended by a signal."""
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """Signals that end a process in order."""
 ERROR, NOTE = "overfly: ", "overfly: note: "
-"""What a line on stderr begins with: an error, and what only tells how things are."""
+"""Prefixes of lines on stderr: of an error, and of a note."""
 REPEAT_S = 5.0
-"""Time after which a process that waits says so, and says it again."""
+"""Interval at which a waiting process reports for what it waits."""
 
 _PR_SET_PDEATHSIG, _PR_GET_CHILD_SUBREAPER = 1, 37
 
 
 class FailedError(OverflyError):
-    """The work failed though the command was right: one sentence for the user, exit code 1."""
+    """The work failed though the command was right. The text is one sentence for the user; exit code 1."""
 
 
 def tell(text: str, prefix: str = ERROR) -> None:
-    """Print a line on stderr. Never raises: a stderr that is closed, full or gone must not fail the work."""
+    """Print a line on stderr. Never raises: a stderr that cannot be written must not end the process."""
     with suppress(OSError, ValueError):
         print(f"{prefix}{printable(text)}", file=sys.stderr, flush=True)
 
@@ -47,15 +47,15 @@ def note(text: str) -> None:
 
 
 class Reminder:
-    """Says every `REPEAT_S` seconds what a process waits for, as long as its work stands still."""
+    """Tell every `REPEAT_S` seconds that the work of a process does not advance."""
 
     def __init__(self) -> None:
         self._since, self._at = time.monotonic(), None
         self.asked = False
-        """True from a question to its answer, where another process knows what is waited for."""
+        """True while a question to another process, about the cause of the waiting, is unanswered."""
 
     def due(self, at: Any = None) -> bool:
-        """True every `REPEAT_S` seconds, once each, while `at`, which tells how far the work is, stays the same."""
+        """Return True once every `REPEAT_S` seconds while `at`, the progress of the work, does not change."""
         now = time.monotonic()
         if at != self._at:
             self._since, self._at, self.asked = now, at, False
@@ -66,16 +66,16 @@ class Reminder:
 
 
 def standard_streams() -> None:
-    """Make stdin, stdout and stderr usable whatever the parent did to them.
+    """Make stdin, stdout and stderr usable, whatever the parent did to them.
 
-    A closed one is opened on /dev/null, or the next file to be opened would take its place. A character that the
+    A closed one is opened on /dev/null; otherwise the next opened file would get its number. A character that the
     locale's encoding lacks is written as an escape sequence instead of raising UnicodeEncodeError.
     """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDONLY if number == 0 else os.O_WRONLY)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDONLY if number == 0 else os.O_WRONLY)  # gets the lowest free number
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:  # Python found it closed
@@ -86,11 +86,11 @@ def standard_streams() -> None:
 
 
 def inherited_signals() -> None:
-    """Look at the signal state that the parent left.
+    """Adopt or reset the signal state that the parent left.
 
-    Respected: HUP and INT that it ignores (nohup; a background job of a script), and TERM; children of this process get
-    TERM back, since their supervisor ends them by it. Reset: a blocked mask, and CHLD, without which the end of a child
-    is lost.
+    Kept: ignored HUP and INT (nohup, a background job of a script), and ignored TERM in this process. Its children get
+    TERM back, since their supervisor ends them with it. Reset: blocked signals, and CHLD, without which the end of a
+    child is not noticed.
     """
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [])
@@ -103,17 +103,17 @@ def _ignore(_number: int, _frame: FrameType | None) -> None:
 
 
 def handle(number: int, handler: Callable[[int, FrameType | None], Any] | signal.Handlers) -> None:
-    """Install a signal handler, unless the parent has the signal ignored."""
+    """Install a signal handler, unless the parent made the process ignore the signal."""
     if signal.getsignal(number) not in {signal.SIG_IGN, _ignore}:
         signal.signal(number, handler)
 
 
 class Stop:
-    """True once SIGTERM, SIGINT or SIGHUP came; a second signal ends the process at once."""
+    """True after SIGTERM, SIGINT or SIGHUP. A second signal ends the process at once."""
 
     def __init__(self) -> None:
         self.asked, self.code = False, STOPPED
-        """Whether to stop, and the exit code of a process that did: 128 + the signal's number."""
+        """True when the process must stop; its exit code then, 128 + the signal's number."""
         for number in ENDING:
             handle(number, self._note)
 
@@ -127,9 +127,9 @@ class Stop:
 
 
 def become_child(parent: int) -> None:
-    """Prepare a process that `parent` started: its streams, its signals, and that it dies with its parent.
+    """Prepare a child process: its streams, its signals, and its end with the end of its parent.
 
-    `parent` is 0 for a process that was started by hand.
+    `parent`: process id, 0 for a process that was started by hand.
     """
     standard_streams()
     inherited_signals()
@@ -137,7 +137,7 @@ def become_child(parent: int) -> None:
 
 
 def die_with_parent(parent: int) -> None:
-    """Ask Linux to send SIGKILL when the parent dies; leaves at once if it is dead already. 0: nothing to do."""
+    """Ask Linux to send SIGKILL when the parent ends; exit if it has ended already. `parent` 0: do nothing."""
     if not parent:
         return
     if sys.platform == "linux":
@@ -147,7 +147,7 @@ def die_with_parent(parent: int) -> None:
 
 
 def run(main: Callable[[], int], mistakes: tuple[type[Exception], ...]) -> int:
-    """Run `main`; a user's mistake or a failure becomes one sentence on stderr and exit code 2 or 1, no traceback."""
+    """Run `main` and return its exit code. A mistake or failure is one sentence on stderr and exit code 2 or 1."""
     try:
         return main()
     except FailedError as error:
@@ -161,8 +161,7 @@ def run(main: Callable[[], int], mistakes: tuple[type[Exception], ...]) -> int:
 def run_child(main: Callable[[], int], mistakes: tuple[type[Exception], ...]) -> int:
     """Run `main` as `run` does, in a process whose supervisor reads its output.
 
-    An error that is not a user's mistake leaves its traceback there, and as the last line the sentence that the
-    supervisor repeats.
+    An unexpected error prints its traceback, and as the last line the sentence that the supervisor repeats.
     """
     try:
         return run(main, mistakes)
@@ -173,20 +172,20 @@ def run_child(main: Callable[[], int], mistakes: tuple[type[Exception], ...]) ->
 
 
 def how_it_ended(code: int) -> str:
-    """How a process ended, by its exit code, or minus the number of the signal that killed it."""
+    """Return how a process ended, by its exit code, or minus the number of the signal that killed it."""
     if code >= 0:
         return f"ended with exit code {code}"
     return f"was killed by {signal.Signals(-code).name}"
 
 
 def last_error(output: str) -> str:
-    """The last error that a process printed, without its prefix; empty when its last line is not one of ours."""
+    """Return the last error that a process printed, without prefix; empty when its last line is not such an error."""
     lines = [line for line in output.strip().splitlines() if not line.startswith(NOTE)]
     return printable(lines[-1].removeprefix(ERROR)) if lines and lines[-1].startswith(ERROR) else ""
 
 
 def adopts_orphans() -> bool:
-    """True where a process whose parent was killed becomes a child of this one: in a container, or a subreaper."""
+    """Return True when orphans become children of this process: as process 1 of a container, or as a subreaper."""
     if os.getpid() == 1:
         return True
     flag = ctypes.c_int(0)
@@ -196,7 +195,7 @@ def adopts_orphans() -> bool:
 
 
 def threads() -> int:
-    """Threads of this process, those that libraries started included, where the system tells."""
+    """Return the number of threads of this process, with those of libraries where the system reports them."""
     try:
         return sum(1 for _ in Path("/proc/self/task").iterdir())
     except OSError:

@@ -1,8 +1,8 @@
-"""The sockets: the TMC binds, everybody else connects. Only this module and the services know ZeroMQ.
+"""Open and use the sockets: the TMC binds, all other processes connect.
 
-Options follow what was measured (docs/explanation/architecture.md): no linger, since it hangs at exit; a bounded queue,
-since the mark counts messages and not bytes; a limit on each part; heartbeats on the connecting side only, because a
-bound ROUTER with heartbeats can be aborted by a peer that fills its mark and leaves.
+Options follow measurements (docs/explanation/architecture.md): no linger, since it hangs at exit; a short queue, since
+its limit counts messages, not bytes; a size limit per frame; heartbeats on the connecting side only, because a peer
+that fills its queue and leaves can abort a bound ROUTER with heartbeats.
 """
 
 from __future__ import annotations
@@ -19,21 +19,19 @@ import zmq
 
 from tmc.wire.codec import CodecError, decode, encode
 from tmc.wire.endpoints import EndpointError, learner_endpoint, listens, parse, to_bind, to_connect
-from tmc.wire.fields import FRAME_LIMIT
+from tmc.wire.fields import FRAME_LIMIT_BYTES
 from tmc.wire.messages import Message
 
-PART_LIMIT = FRAME_LIMIT
-"""Largest frame that a socket takes, bytes; the codec has tighter limits for the header."""
-PARTS = 16
+MAX_FRAMES = 16
 """Most frames in a message."""
 NAME = re.compile(rb"uav-[0-9]{3,5}|learner|observer-[0-9a-z-]{1,40}")
-"""Addresses that a client may call itself."""
+"""The names of clients."""
 FIXES = {
     errno.EADDRNOTAVAIL: "choose an address of this machine, or * for all of them",
     errno.ENODEV: "choose an address of this machine, or * for all of them",
     errno.EACCES: "choose a port from 1024 on",
 }
-"""What to do where an endpoint cannot be bound, by the reason."""
+"""The fix for an endpoint that cannot be bound, by the reason."""
 __all__ = [
     "EndpointError",
     "check_free",
@@ -51,7 +49,7 @@ __all__ = [
 
 
 def free_port() -> int:
-    """A tcp port that is free on this machine, and whose successor is free too."""
+    """Return a free tcp port of this machine whose successor is free too."""
     while True:
         with socket.socket() as first, socket.socket() as second:
             first.bind(("127.0.0.1", 0))
@@ -74,13 +72,13 @@ def check_free(endpoint: str) -> None:
 
 
 def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Socket[Any]:
-    """A bound ROUTER. A client that comes back takes over its name; a message to nobody raises."""
+    """Return a bound ROUTER. A client that reconnects takes over its name; a message to no client raises."""
     place = to_bind(endpoint)
     sock: zmq.Socket[Any] = context.socket(zmq.ROUTER)
     sock.setsockopt(zmq.LINGER, 0)
     sock.setsockopt(zmq.RCVHWM, queue)
     sock.setsockopt(zmq.SNDHWM, 1000)
-    sock.setsockopt(zmq.MAXMSGSIZE, PART_LIMIT)
+    sock.setsockopt(zmq.MAXMSGSIZE, FRAME_LIMIT_BYTES)
     sock.setsockopt(zmq.ROUTER_HANDOVER, 1)
     sock.setsockopt(zmq.ROUTER_MANDATORY, 1)
     sock.setsockopt(zmq.IPV6, place.ipv6)
@@ -95,7 +93,7 @@ def router(context: zmq.Context[Any], endpoint: str, queue: int = 32) -> zmq.Soc
 
 
 def unlink(endpoint: str) -> None:
-    """Remove the socket's file that a ROUTER left, now that it is closed: ZeroMQ does not."""
+    """Remove the socket file of a closed ROUTER, which ZeroMQ leaves."""
     path = Path(parse(endpoint).path or "@")
     with suppress(OSError):
         if path.is_socket() and not listens(endpoint):
@@ -103,12 +101,12 @@ def unlink(endpoint: str) -> None:
 
 
 def dealer(context: zmq.Context[Any], endpoint: str, name: str) -> zmq.Socket[Any]:
-    """A DEALER that calls itself `name`, connected; ZeroMQ reconnects by itself."""
+    """Return a connected DEALER with this name. ZeroMQ reconnects by itself."""
     place = to_connect(endpoint)
     sock: zmq.Socket[Any] = context.socket(zmq.DEALER)
     sock.setsockopt(zmq.LINGER, 0)
     sock.setsockopt(zmq.IDENTITY, name.encode())
-    sock.setsockopt(zmq.MAXMSGSIZE, PART_LIMIT)
+    sock.setsockopt(zmq.MAXMSGSIZE, FRAME_LIMIT_BYTES)
     sock.setsockopt(zmq.RECONNECT_IVL, 50)
     sock.setsockopt(zmq.RECONNECT_IVL_MAX, 200)
     sock.setsockopt(zmq.IPV6, place.ipv6)
@@ -124,14 +122,14 @@ def dealer(context: zmq.Context[Any], endpoint: str, name: str) -> zmq.Socket[An
 
 
 def waiting(endpoint: str) -> str:
-    """Why no answer comes from an endpoint, for a client that waits for one."""
+    """Return why no answer comes from an endpoint, for a client that waits for one."""
     if listens(endpoint):
-        return f"{endpoint}, where something listens and does not answer as one: is it the TMC's --bind?"
+        return f"{endpoint}, where a process listens but does not answer as a TMC: is it the TMC's --bind?"
     return f"{endpoint}, where nothing listens so far"
 
 
 def send(sock: zmq.Socket[Any], message: Message, to: bytes | None = None) -> bool:
-    """Send now; False when the other side is gone or its queue is full."""
+    """Send a message without waiting; return False when the other side is gone or its queue is full."""
     frames = encode(message)
     parts: Sequence[Any] = frames if to is None else [to, *frames]
     try:
@@ -142,23 +140,23 @@ def send(sock: zmq.Socket[Any], message: Message, to: bytes | None = None) -> bo
 
 
 def receive(sock: zmq.Socket[Any]) -> list[Any] | None:
-    """The frames of the next message, or None when there is none now. Large frames are not copied."""
-    if not int(sock.get(zmq.EVENTS)) & zmq.POLLIN:  # cheaper than the exception that tells of none
+    """Return the frames of the next message, or None when there is none. Large frames are not copied."""
+    if not int(sock.get(zmq.EVENTS)) & zmq.POLLIN:  # cheaper than an exception
         return None
     parts = sock.recv_multipart(zmq.NOBLOCK, copy=False)
     return [p.buffer if len(p) > 4096 else p.bytes for p in parts]
 
 
 def sender_name(identity: bytes) -> str:
-    """How the log calls a client: its own name if that is one of ours, otherwise the hex of its identity."""
+    """Return the name of a client for the log: its own if valid, otherwise its identity in hex."""
     return identity.decode() if NAME.fullmatch(identity) else identity.hex()[:64]
 
 
 def receive_message(sock: zmq.Socket[Any]) -> Message | None:
-    """The next valid message of a client's socket, or None. A frame that is none raises CodecError."""
+    """Return the next message of a client's socket, or None. CodecError for frames that are not a message."""
     frames = receive(sock)
     if frames is None:
         return None
-    if len(frames) > PARTS:
-        raise CodecError("malformed", f"{len(frames)} frames, at most {PARTS} are taken")
+    if len(frames) > MAX_FRAMES:
+        raise CodecError("malformed", f"{len(frames)} frames, at most {MAX_FRAMES} are allowed")
     return decode(frames)

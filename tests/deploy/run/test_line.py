@@ -164,7 +164,7 @@ def test_what_cannot_be_written_is_dropped(out: Callable[[], TextIO]) -> None:
     line = Line(out())
     for _ in range(3):
         line.show("waiting")
-        line.share("sealing", 0.5)
+        line.share("compacting", 0.5)
         line.print("stopped")
         line.clear()
 

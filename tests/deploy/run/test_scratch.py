@@ -17,7 +17,7 @@ from actors import tracks
 from deploy.run import scratch
 from tests.command import LINE
 from tmc.kernel.config import ConfigError, build
-from tmc.wire.endpoints import FEED, LONGEST_PATH
+from tmc.wire.endpoints import LEARNER_SUFFIX, MAX_PATH_BYTES
 
 CONFIG = build({"team.size": 3, "training.ticks": 1000})
 SIZE = tracks.table_bytes(3, 1000)
@@ -63,12 +63,12 @@ def test_a_path_that_is_too_long_for_a_socket_is_passed_over(
     places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = set()
-    for length in range(1, LONGEST_PATH):
+    for length in range(1, MAX_PATH_BYTES):
         deep = places[0] / ("x" * length)
         deep.mkdir()
         monkeypatch.setattr(scratch, "MEMORY", deep)
         with scratch.made(CONFIG) as made:
-            fits = len(os.fsencode(deep / made.folder.name / f"sync{FEED}")) <= LONGEST_PATH
+            fits = len(os.fsencode(deep / made.folder.name / f"sync{LEARNER_SUFFIX}")) <= MAX_PATH_BYTES
             assert made.folder.parent == (deep if fits else places[1])
             found.add(fits)
         deep.rmdir()  # so nothing was left in it

@@ -303,7 +303,7 @@ def test_a_preloaded_module_that_starts_a_thread_is_left_out(tmp_path: Path) -> 
     line = forkserver_command("actors", tmp_path, ["threaded"])
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     server = ForkServer(line, environment, tmp_path / "forkserver.txt")
-    command = ("--id", "0", "--connect", f"ipc://{tmp_path}/nobody", "--out", str(tmp_path))
+    command = ("--id", "0", "--connect", f"ipc://{tmp_path}/no-tmc", "--out", str(tmp_path))
     child = server.start("uav-000", command, tmp_path / "uav-000.txt")
     try:
         until = time.monotonic() + 60

@@ -206,4 +206,4 @@ def test_a_lead_that_no_rule_allows_is_seen(monkeypatch: pytest.MonkeyPatch, tmp
     lead = asynchrony.farthest(config, facts, tmp_path, 0)
     assert (lead.ticks, lead.uav, lead.at_tick, lead.cells, lead.allowed) == (5, 1, 7, 1, False)
     result = asynchrony.Result(asynchrony.TRIALS[3], 0, lead, 1.0, None)
-    assert not result.passed and result.row().endswith("LEAD NOT ALLOWED")
+    assert not result.passed and result.row().endswith("TOO FAR AHEAD")

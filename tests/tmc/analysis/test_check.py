@@ -35,9 +35,9 @@ def broken(result: Result) -> dict[str, str]:
     return {row.name: str(row.violation) for row in result.rows if row.violation}
 
 
-# Sound journals.
+# Intact journals.
 
-SOUND: list[dict[str, object]] = [
+INTACT: list[dict[str, object]] = [
     CROWD,
     CROWD | {"scenario": 1},
     CROWD | {"comms.period": 1},
@@ -56,7 +56,7 @@ SOUND: list[dict[str, object]] = [
 ]
 
 
-@pytest.mark.parametrize("values", SOUND, ids=str)
+@pytest.mark.parametrize("values", INTACT, ids=str)
 def test_sound_journals_pass(fly: Fly, values: dict[str, object]) -> None:
     result = check(fly(**values))
     assert broken(result) == {}
@@ -105,7 +105,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
             moved |= record is not None or before != (pilot.t, pilot.phase)
             if record is not None:
                 deliver(step._exchange(pilot.uav, record))
-        if not moved:  # everybody waits: time goes by, and all but the dead one are heard
+        if not moved:  # all UAVs wait: time goes by, and all but the dead one are heard
             now += 100.0
             for i, member in enumerate(station.roster):
                 member.heard = member.heard if i == 2 and away else now
@@ -306,7 +306,7 @@ def onto_another(fly: Fly, values: dict[str, Any]) -> Change:
 
 
 def extra_sighting(message: Any) -> bool:
-    """Of a cell that is no road, so that the UAV's map stays as it was."""
+    """Of a cell that is not a road, so that the UAV's map stays as it was."""
     if message.seen_tick:
         return False
     message.seen_tick.append(message.tick)

@@ -290,7 +290,7 @@ def test_what_is_no_run_is_refused(tmp_path, fly):
     folder = copy_of(fly(), tmp_path)
     (folder / "tmc.mcap").unlink()
     with LogWriter(folder / "tmc.mcap", "tmc", JournalConfig(), {}) as log:
-        log.log("info", "nobody came")
+        log.log("info", "no UAV came")
     with pytest.raises(RecordError, match="holds no flight"):
         read(folder)
     (folder / "tmc.mcap").rename(folder / "uav-000.mcap")

@@ -206,7 +206,7 @@ def test_beliefs_of_the_tmc_are_those_that_it_logged(flown: RunData) -> None:
         assert believed[sync.tick] == pytest.approx(sync.believed, rel=1e-12)
 
 
-def test_where_everybody_is(flown: RunData) -> None:
+def test_where_each_uav_is(flown: RunData) -> None:
     world, found = flown.world, messages(replay(flown.folder))
     cells = {(tick, uav): cell for tick, uav, cell in queries.moves(flown.folder, 2)}
     for uav in range(world.config.team.size):

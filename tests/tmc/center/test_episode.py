@@ -135,7 +135,7 @@ class Referee:
             self.sums.append(float(len(active)))
 
     def blocked(self) -> dict[str, int]:
-        """Blocked moves by cause, from cells and actions alone: whoever is not where the action leads was blocked."""
+        """Count blocked moves by cause: a UAV that is not where its action leads was blocked."""
         counts = dict.fromkeys(("GRID", "OBSTACLE", "UAV"), 0)
         for i, track in enumerate(self.tracks):
             for t in range(T):

@@ -69,7 +69,7 @@ class Losing:
                 if record is not None:
                     self.deliver(self.step._exchange(pilot.uav, record))
             stuck = 0 if moved else stuck + 1
-            if not moved:  # everybody waits: time goes by, and all but the dead one are heard
+            if not moved:  # all UAVs wait: time goes by, and all but the dead one are heard
                 assert stuck < 5, "the mission hangs"
                 now += 100.0
                 for i, member in enumerate(self.step.station.roster):
@@ -249,4 +249,4 @@ def test_a_full_memory_of_which_nothing_is_left_is_not_drawn_from() -> None:
     step.station.finalise()
     assert len(replay) == 0 and step.station.rate_limiter.samples_due
     assert list(feed.serve(0, 0)) == []
-    assert step.station.phase == "done"  # nor does anybody wait for it
+    assert step.station.phase == "done"  # and no process waits for it

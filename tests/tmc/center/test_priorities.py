@@ -106,7 +106,9 @@ def test_numbers_are_drawn_in_proportion_to_their_mass(size: int) -> None:
 
 
 def test_a_minibatch_is_spread_evenly_over_the_mass() -> None:
-    """With B shares, whoever has the mass of B P(i) shares is drawn that often, to within one share at either end."""
+    """With B shares, a transition with the mass of B P(i) shares is drawn that often, to within one share at either
+    end.
+    """
     mine, plain = some(200)
     total = sum(plain.masses.values())
     for number in range(20):
@@ -147,7 +149,7 @@ def test_numbers_that_are_gone_or_to_come_change_nothing() -> None:
 
 @pytest.mark.parametrize("beta", [0.0, 0.4, 1.0])
 def test_weights_are_those_of_the_paper(beta: float) -> None:
-    """(N P(i))^-beta over the largest of the minibatch; with beta = 1 each counts as if all were drawn alike."""
+    """(N P(i))^-beta over the largest of the minibatch; with beta = 1 as if all were drawn equally often."""
     mine, plain = some(300)
     numbers = mine.draw(uniforms(1, Stream.REPLAY, 32))
     total, held = sum(plain.masses.values()), len(plain.masses)

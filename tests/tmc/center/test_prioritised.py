@@ -148,6 +148,6 @@ def test_a_recovered_tmc_has_the_first_priorities(mission: Callable[..., Any], t
     station = Station(flown.world, "run", learning=False, policy=b"policy")
     recovery.recover(station, tmp_path / "tmc.mcap", 1.0)
     before, after = masses(flown.station.replay), masses(station.replay)
-    judged = {key for key in after if key[1] < T - 1 and (key[0], key[1] + 2, key[2]) in after}
-    assert 50 < len(judged) < len(before)
-    assert {key: after[key] for key in judged} == {key: before[key] for key in judged}
+    with_errors = {key for key in after if key[1] < T - 1 and (key[0], key[1] + 2, key[2]) in after}
+    assert 50 < len(with_errors) < len(before)
+    assert {key: after[key] for key in with_errors} == {key: before[key] for key in with_errors}

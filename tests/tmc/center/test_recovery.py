@@ -257,7 +257,7 @@ def test_a_journal_cut_anywhere_gives_the_state_and_goes_on(
     assert plain(missing, case.learning) == plain(follows, case.learning)
     undecided = rest[len(follows) :]
     if any(e.topic == "/tmc/lost" for e in undecided):
-        return  # whoever was away is waited for again
+        return  # a UAV that was away is waited for again
     greet(station, reference, flown.updates[told_of - 1] if told_of else 0)
     later = station.out.take().entries
     assert later == [] or undecided
@@ -268,7 +268,7 @@ def test_a_journal_cut_anywhere_gives_the_state_and_goes_on(
 
 
 def greet(station: Station, reference: Station, updates: int) -> None:
-    """Everybody who was there says hello again."""
+    """Make all UAVs that were there say hello again."""
     if reference.learning and reference.sample_queue.incarnation >= 0:
         station.handle(LEARNER, m.Hello("learner", -1, 1, updates), 1.0)
     for i, member in enumerate(reference.roster):
@@ -296,7 +296,7 @@ def test_a_tmc_killed_in_flight_flies_the_same(
     """Commits fall at random, kills too, and a kill takes any number of the entries that are not committed."""
     if case.learning:
         case = replace(case, learning=False)
-    calm = mission(case.values, town).play()
+    undisturbed = mission(case.values, town).play()
     rough, rng = mission(case.values, town), Random(seed)
 
     def groups() -> bool:
@@ -310,16 +310,16 @@ def test_a_tmc_killed_in_flight_flies_the_same(
             folder = tmp_path / f"{next(FOLDERS)}"
             station, missing = recovered(case, rough.world, journalled(folder, rough.world, kept))
             rough.restart(station, kept + missing)
-    assert rough.flown() == calm.flown()
-    assert told_by(rough.entries) == told_by(calm.entries)
+    assert rough.flown() == undisturbed.flown()
+    assert told_by(rough.entries) == told_by(undisturbed.entries)
     record = {(r.uav, r.sequence) for r in rough.records}
-    assert len(record) == len(rough.records) == len(calm.records)
+    assert len(record) == len(rough.records) == len(undisturbed.records)
 
 
 def told_by(entries: list[JournalEntry]) -> list[Any]:
     """What a mission's journal tells, however its truth was cut into messages: the digests at the ends included."""
-    alike = ("/tmc/sync", "/tmc/state", "/tmc/episode", "/tmc/last_visit")
-    found: list[Any] = [plain([e for e in entries if e.topic == topic], True) for topic in alike]
+    common = ("/tmc/sync", "/tmc/state", "/tmc/episode", "/tmc/last_visit")
+    found: list[Any] = [plain([e for e in entries if e.topic == topic], True) for topic in common]
     metrics = [e.values for e in entries if e.topic == "/tmc/metrics"]
     return [*found, [(v["episode"], u) for v in metrics for u in v["uncertainty"]]]
 

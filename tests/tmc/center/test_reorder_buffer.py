@@ -1,4 +1,4 @@
-"""UAVs that know more than the TMC, which was started again: all is told in its turn, and nobody waits for ever."""
+"""UAVs that know more than a restarted TMC resend everything in its turn, and no process waits for ever."""
 
 from __future__ import annotations
 

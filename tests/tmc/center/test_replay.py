@@ -79,8 +79,8 @@ def test_the_observation_is_what_the_paper_says(mission: Callable[..., Any], tow
             for cell in (cells[i], *peers[i]):
                 tau[i][cell] = t
         if t % T_u == 0:
-            everybody = [max(column) for column in zip(*tau, strict=True)]
-            tau = [list(everybody) for _ in range(N)]
+            team_knows = [max(column) for column in zip(*tau, strict=True)]
+            tau = [list(team_knows) for _ in range(N)]
         o, _ = flown.rebuilt(np.full(N, flown.row(1, t)), np.arange(N))
         for i in range(N):
             here, terrain, u = (plane.ravel().tolist() for plane in o[i])

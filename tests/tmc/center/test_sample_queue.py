@@ -1,4 +1,4 @@
-"""The TMC's side of the learner: requests are answered as far as minibatches are owed, and never to a stranger."""
+"""The TMC's side of the learner: requests are answered as far as minibatches are due, and never to a stranger."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def feed_of(mission: Callable[..., Any], town: RoadMap, values: dict[str, Any] =
 
 
 def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., Any], town: RoadMap) -> None:
-    """A request that waited for a TMC to come back: the learner must first hear that numbers may begin anew."""
+    """A request that waited for a TMC to come back: the learner must first hear that the numbers may begin again."""
     sample_queue = feed_of(mission, town)
     assert sample_queue.ask(SampleRequest(1)) is None and list(sample_queue.serve(0, 0)) == []
     sample_queue.welcome(Hello("learner", -1, 9))
@@ -38,7 +38,7 @@ def test_nothing_goes_to_a_learner_that_was_not_welcomed(mission: Callable[..., 
     assert (minibatch.request, minibatch.episodes, minibatch.ticks) == (2, 0, 20)
     s = sample_queue.replay.sample(0, 4)
     assert np.array_equal(minibatch.index, s.index) and np.array_equal(minibatch.u, s.views.u)
-    assert minibatch.weight.size == 0  # all count alike
+    assert minibatch.weight.size == 0  # all have the same weight
 
 
 def test_only_so_many_requests_are_taken(mission: Callable[..., Any], town: RoadMap) -> None:
@@ -63,7 +63,7 @@ def test_a_learner_that_makes_up_for_what_it_lost_hears_of_the_episodes_in_their
 PRIORITISED = {**VALUES, "team.controller": "policy", "replay.priority_exponent": 0.5}
 
 
-def judged(request: int, index: list[int], errors: list[float]) -> SampleRequest:
+def request_with_errors(request: int, index: list[int], errors: list[float]) -> SampleRequest:
     return SampleRequest(request, np.array(index, "<i8"), np.array(errors, "<f4"))
 
 
@@ -73,10 +73,10 @@ def test_errors_become_priorities_once_the_learner_is_welcome(mission: Callable[
     priorities = sample_queue.replay.priorities
     assert priorities is not None
     before = priorities.mass(np.arange(60)).tolist()
-    assert sample_queue.ask(judged(1, [7, 8], [25.0, 0.0])) is None
+    assert sample_queue.ask(request_with_errors(1, [7, 8], [25.0, 0.0])) is None
     assert priorities.mass(np.arange(60)).tolist() == before
     sample_queue.welcome(Hello("learner", -1, 9))
-    assert sample_queue.ask(judged(2, [7, 8, 9999], [25.0, 0.0, 1.0])) is None  # the last one is not held
+    assert sample_queue.ask(request_with_errors(2, [7, 8, 9999], [25.0, 0.0, 1.0])) is None  # the last one is not held
     after = priorities.mass(np.arange(60))
     assert after[[7, 8]] == pytest.approx([(25 + EPSILON) ** 0.5, EPSILON**0.5])
     assert np.delete(after, [7, 8]).tolist() == np.delete(before, [7, 8]).tolist()
@@ -94,7 +94,7 @@ def test_errors_that_cannot_be_change_nothing(
     sample_queue.welcome(Hello("learner", -1, 9))
     assert sample_queue.replay.priorities is not None
     before = sample_queue.replay.priorities.mass(np.arange(60)).tolist()
-    assert "an error for each transition" in str(sample_queue.ask(judged(1, index, errors)))
+    assert "an error for each transition" in str(sample_queue.ask(request_with_errors(1, index, errors)))
     assert sample_queue.replay.priorities.mass(np.arange(60)).tolist() == before
     assert list(sample_queue.serve(1, 20)) == []  # nor is it taken for a request
 
@@ -102,4 +102,4 @@ def test_errors_that_cannot_be_change_nothing(
 def test_errors_are_refused_where_nobody_asked_for_them(mission: Callable[..., Any], town: RoadMap) -> None:
     sample_queue = feed_of(mission, town)
     sample_queue.welcome(Hello("learner", -1, 9))
-    assert "replay.priority_exponent is 0" in str(sample_queue.ask(judged(1, [1], [0.5])))
+    assert "replay.priority_exponent is 0" in str(sample_queue.ask(request_with_errors(1, [1], [0.5])))

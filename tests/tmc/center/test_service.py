@@ -1,4 +1,4 @@
-"""The TMC's process, killed before a group commit: what it told UAVs for good, its next incarnation knows too."""
+"""The TMC's process, killed before a group commit: what UAVs act on, its next incarnation knows too."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_answers_are_not_far_ahead_of_what_is_committed(
 
 
 def test_an_episode_is_committed_before_the_next_one_begins(client: Callable[[str], Client], tmp_path: Path) -> None:
-    """Nobody could tell a process that flew its end again where the others were."""
+    """No UAV could tell a process that flew its end again where the others were."""
     short = World(build({**VALUES, "training.ticks": 20, "training.episodes": 2, "team.controller": "planner:greedy"}))
     with killed_in_the_end(short, tmp_path):
         uav = Uav(client("uav-000"), short, 1)

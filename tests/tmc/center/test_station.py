@@ -257,7 +257,7 @@ def test_a_record_before_anything_flies_is_rejected(station_of: Callable[..., St
 def test_a_process_that_the_tmc_does_not_know_is_not_sent_away(
     station_of: Callable[..., Station], flying: Station
 ) -> None:
-    """A TMC that was started again has forgotten everybody: "fenced" would end UAVs that only have to say hello."""
+    """A restarted TMC has forgotten all clients: "fenced" would end UAVs that only have to say hello."""
     rejects(station_of(), "uav-000", first_record(flying, 0), "state", "hello")
 
 
@@ -466,7 +466,7 @@ def test_minibatches_come_as_they_are_owed(learning: Learning) -> None:
     assert learning.ask(10, 11) == []
     learning.ship(0, 0)
     assert learning.ship(1, 4)[-1][0].startswith("uav")  # learning starts here: 8 transitions are held
-    sends = learning.ship(5, 8)  # and 4 ticks more: 4 minibatches are owed, 2 were asked for
+    sends = learning.ship(5, 8)  # and 4 ticks more: 4 minibatches are due, 2 were asked for
     batches = [x for to, x in sends if to == LEARNER]
     assert [b.request for b in batches] == [10, 11]  # type: ignore[attr-defined]
     for b in batches:
@@ -479,7 +479,7 @@ def test_the_limiter_holds_answers_back_and_releases_them(learning: Learning) ->
     learning.ship(0, 0)
     learning.ship(1, 4)
     assert learning.station.waiting_for() == ["uav-000", "uav-001"]
-    assert learning.ship(5, 8) == []  # 4 owed, 2 allowed: the UAVs wait for the learner
+    assert learning.ship(5, 8) == []  # 4 due, 2 allowed: the UAVs wait for the learner
     assert learning.station.waiting_for() == ["learner"]
     assert kinds(learning.ask(1)) == [("learner", "Minibatch")]
     sends = learning.ask(2)
@@ -498,7 +498,7 @@ def test_a_repeat_of_a_held_answer_does_not_get_around_the_limiter(learning: Lea
 
 
 def test_the_next_episode_does_not_get_around_the_limiter(learning: Learning) -> None:
-    """Its begin is held as the last maps are, from who says its last record again and from who is there anew."""
+    """Its begin is held back as the last maps are, from a UAV that resends its record and from one that is back."""
     learning.ship(0, 0)
     first, T = 1, learning.station.config.training.ticks
     while first <= T:
@@ -630,7 +630,7 @@ def test_the_end_reaches_everybody(learning: Learning, in_flight: int) -> None:
 
 
 def test_a_learner_that_comes_back_after_the_end_is_told(learning: Learning) -> None:
-    """It lost its last updates: it is owed them, and the end is told again when it has caught up."""
+    """The learner lost its last updates: they are due again, and it is sent the end again once it has caught up."""
     finish(learning)
     station = learning.station
     learning.ask(0, 1, 2)
@@ -691,14 +691,16 @@ def test_lost_uavs_come_back_and_fly_the_same_cells(
 ) -> None:
     """Processes die at random ticks, with their records lost or not: the journal holds the undisturbed episode."""
     values = {"team.size": 4, "training.ticks": 40, "training.episodes": 2, **PILOTS[pilots]}
-    calm = mission(values, town).play()
+    undisturbed = mission(values, town).play()
     rough = mission(values, town).play(Random(seed), crash=0.03)
-    assert sum(rough.incarnations) > 4 + 3, "nobody was lost"
-    assert rough.flown() == calm.flown()
-    uncertainty = [[e.values["uncertainty"] for e in f.entries if e.topic == "/tmc/episode"] for f in (calm, rough)]
+    assert sum(rough.incarnations) > 4 + 3, "no UAV was lost"
+    assert rough.flown() == undisturbed.flown()
+    uncertainty = [
+        [e.values["uncertainty"] for e in f.entries if e.topic == "/tmc/episode"] for f in (undisturbed, rough)
+    ]
     assert uncertainty[0] == uncertainty[1]
     ticks, uavs = np.repeat(np.arange(2 * 41), 4), np.tile(np.arange(4), 2 * 41)
-    ours, theirs = (f.rebuilt(ticks, uavs) for f in (calm, rough))
+    ours, theirs = (f.rebuilt(ticks, uavs) for f in (undisturbed, rough))
     assert all(a.tobytes() == b.tobytes() for a, b in zip(ours, theirs, strict=True))
     assert rough.station.rejected == 0
 
@@ -728,7 +730,7 @@ def test_a_uav_comes_back_to_the_knowledge_that_it_had(mission: Callable[..., An
 def test_uavs_with_beacons_fly_the_same_cells(
     mission: Callable[..., Any], town: RoadMap, scenario: int, phase: str
 ) -> None:
-    """No table: positions come by beacon. Nothing is lost here, so nobody has to ask."""
+    """No table: positions come by beacon. Nothing is lost here, so no UAV has to ask."""
     values = {"team.size": 4, "training.ticks": 60, "training.episodes": 2, "scenario": scenario}
     values |= {"comms.phase": phase, "exploration.end": 0.3}
     flown = mission(values, town, radio=True).play(Random(7))

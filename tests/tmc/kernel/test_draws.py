@@ -125,7 +125,7 @@ def test_draws_of_one_tick_after_the_other_are_uncorrelated() -> None:
 
 
 def test_distinct_gives_every_selection_equally_often() -> None:
-    """Exact: over a grid of uniforms that hits each branch alike, all ordered pairs of four appear 12 times."""
+    """Exact: over a grid of uniforms that hits each branch equally often, all ordered pairs of four appear 12 times."""
     mids = (np.arange(12) + 0.5) / 12
     pairs = [tuple(distinct(np.array(u), np.array([5, 7, 11, 13]), 2)) for u in product(mids, mids)]
     assert {pair: pairs.count(pair) for pair in set(pairs)} == dict.fromkeys(permutations((5, 7, 11, 13), 2), 12)

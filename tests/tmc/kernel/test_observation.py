@@ -61,7 +61,7 @@ def test_an_image_drawn_over_in_place_has_the_same_bits(view: dict[str, Any], wo
         peers = peers_of(observer, int(cell), team.tolist(), int(me))
         canvas.draw(int(cell), peers, u)
         assert canvas.image.tobytes() == observer.observe(int(cell), peers, u).tobytes()
-    assert not image.any()  # nobody else's
+    assert not image.any()  # no other UAV's
 
 
 @pytest.mark.parametrize("scenario", [1, 2])

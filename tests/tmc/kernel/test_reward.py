@@ -63,7 +63,7 @@ def test_aligned_credit_is_u_over_one_minus_gamma_q(novel: bool, u: float) -> No
 
 @pytest.mark.parametrize("alpha", [0.01, 0.3])
 def test_aligned_credit_is_the_discounted_sum_that_a_visit_takes_away(alpha: float) -> None:
-    """sum over s of gamma^s (u had nobody come - u after the visit), s from the visit on."""
+    """sum over s of gamma^s (u without the visit - u after it), s from the visit on."""
     gamma, ticks, age = 0.9, 400, 37
     law = UncertaintyLaw(np.array([alpha]), ticks + age)
     saved = sum(gamma**s * (law.value(0, 0, age + s) - law.value(0, age, age + s)) for s in range(ticks))

@@ -123,7 +123,7 @@ def test_uncounted_cells_get_the_quiet_rate_of_the_file(document: dict[str, Any]
     m = load_map(TORONTO, "all", "none")
     counted = np.array(document["rates"]["volume"], float).ravel()
     missing = m.road & np.isnan(counted)
-    assert missing.sum() == 409 - 381 + 2  # the collectors, and a block of York St that nobody counted
+    assert missing.sum() == 409 - 381 + 2  # the collectors, and a block of York St that was not counted
     ratio = m.rates["volume"][missing] / m.rates["volume"][m.grid.cell(0, 0)]
     np.testing.assert_allclose(ratio, document["rates"]["uncounted"]["volume"] / counted[0])
 
@@ -303,20 +303,20 @@ def test_the_largest_map_and_one_row_more() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "has no raster row: write a line a row"),
-        ("\n \n", "has no raster row: write a line a row"),
-        ("name: nothing else\n", "has no raster row: write a line a row"),
+        ("", "has no raster row: write one line per row"),
+        ("\n \n", "has no raster row: write one line per row"),
+        ("name: nothing else\n", "has no raster row: write one line per row"),
         ("..X\n...\n", "has no road cell in its 2 rows: mark road cells with #"),
-        ("name: a\n\n###\n##\n", "line 4 has 2 cells and the first row 3: make all rows alike"),
-        ("##\n\n##\n", "line 2 has 0 cells and the first row 2: make all rows alike"),
+        ("name: a\n\n###\n##\n", "line 4 has 2 cells and the first row 3: give all rows the same length"),
+        ("##\n\n##\n", "line 2 has 0 cells and the first row 2: give all rows the same length"),
         ("###\n#o#\n", r"line 2, column 2 is 'o': use # \(road\), . \(free\) or X \(blocked\)"),
         ("0,1\n1,3\n", "line 2, column 2 is '3': use #"),
         ("0,1\n1,,1\n", "line 2, column 2 is '': use #"),
         ("0,1\n1,1,\n", "line 2, column 3 is '': use #"),
         ("# #\n#  #\n", "line 2, column 2 is '': use #"),
-        ("0,1\n1\n", "line 2 has 1 cells and the first row 2: make all rows alike"),
-        ("// only words\n", "has no raster row: write a line a row"),
-        ("##\n//\n\n##\n", "line 3 has 0 cells and the first row 2: make all rows alike"),
+        ("0,1\n1\n", "line 2 has 1 cells and the first row 2: give all rows the same length"),
+        ("// only words\n", "has no raster row: write one line per row"),
+        ("##\n//\n\n##\n", "line 3 has 0 cells and the first row 2: give all rows the same length"),
         ("##\nname: late\n", "line 2, column 1 is 'name:': use #"),
         ("metres: 60\n##\n", "line 1 has the unknown key 'metres': use name, cell_m, attribution"),
         ("// a note\n\ncell_m: wide\n##\n", "line 3: cell_m is 'wide': give"),
@@ -326,7 +326,7 @@ def test_the_largest_map_and_one_row_more() -> None:
         ("cell_m: 1e308\n##\n", "cell_m is '1e308': give .* from 0.01 to 100,000"),
         ("cell_m: 1e-300\n##\n", "cell_m is '1e-300': give"),
         ("cell_m: 1e999\n##\n", "cell_m is '1e999': give"),
-        ("name: a\nname: b\n##\n", "line 2 gives 'name' a second time: keep one"),
+        ("name: a\nname: b\n##\n", "line 2 repeats 'name': keep one"),
         ("cell_m: wide\n##\n", "line 1: cell_m is 'wide': give the width of a cell in metres, such as 60"),
         ("cell_m: 0\n##\n", "cell_m is '0': give"),
         ("cell_m: inf\n##\n", "cell_m is 'inf': give"),
@@ -380,7 +380,7 @@ def test_a_map_refuses_arrays_that_disagree() -> None:
         RoadMap("m", grid, 60.0, road, road)
     with pytest.raises(MapError, match="has no road cell"):
         RoadMap("m", grid, 60.0, free, free)
-    with pytest.raises(MapError, match="has an array without one value a cell: give 2 in each"):
+    with pytest.raises(MapError, match="has an array without one value per cell: give 2 in each"):
         RoadMap("m", grid, 60.0, road, free[:1])
     for width in (0, -1.0, 1e308, float("nan"), float("inf")):
         with pytest.raises(MapError, match=r"has cells of .* m: give a width from"):

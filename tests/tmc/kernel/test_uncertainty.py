@@ -169,7 +169,7 @@ def random_flight(grid: Grid, team: int, ticks: int, seed: int) -> NDArray[np.in
 @pytest.mark.parametrize("rates", ["uniform", "uneven"])
 @pytest.mark.parametrize("initial", ["visited", "random"])
 def test_accounting_identity(seed: int, rates: str, initial: str) -> None:
-    """Sum of u_k over ticks = the sum had nobody come - what each visit took away, for any flight and every cell."""
+    """Sum of u_k over ticks = the sum without visits - what each visit took away, for any flight and every cell."""
     grid, ticks = Grid(5, 6), 80
     rng = np.random.default_rng(100 + seed)
     alpha = np.full(grid.size, 0.01) if rates == "uniform" else rng.choice([0.0, 0.003, 0.01, 0.4, 2.0], grid.size)
@@ -185,9 +185,11 @@ def test_accounting_identity(seed: int, rates: str, initial: str) -> None:
             taken[i] += law.value(i, int(last[i]), t, s) * (1 - q ** (ticks - t + 1)) / (1 - q)
             last[i] = t
         total += law.values(last, t, s)
-    nobody = law.values(np.zeros((ticks, law.cells.size), np.uint16), np.arange(1, ticks + 1)[:, None], s).sum(axis=0)
+    unvisited = law.values(np.zeros((ticks, law.cells.size), np.uint16), np.arange(1, ticks + 1)[:, None], s).sum(
+        axis=0
+    )
     assert taken.sum() > 0
-    assert total == pytest.approx(nobody - taken, rel=0, abs=1e-9)
+    assert total == pytest.approx(unvisited - taken, rel=0, abs=1e-9)
 
 
 # The bound on eq. (6)
@@ -238,7 +240,7 @@ def test_bound_is_below_every_flight_of_a_tiny_map(
 
 @pytest.mark.parametrize("alpha", [0.001, 0.01, 0.3])
 def test_bound_is_reached_by_a_perfect_tour_of_uniform_cells(alpha: float) -> None:
-    """One UAV around a block of 2 x 2 cells: nobody does better."""
+    """One UAV around a block of 2 x 2 cells: no team does better."""
     rates = np.full(4, alpha)
     tour = [((0, 1, 3, 2)[t % 4],) for t in range(41)]
     assert lower_bound(rates, 1, 40) == pytest.approx(average(rates, tour), abs=1e-12)
@@ -274,7 +276,7 @@ def test_bound_falls_with_the_team_and_is_zero_when_every_cell_has_a_uav() -> No
 
 @pytest.mark.parametrize("cells", [1, 7, 8, 129, 322, 1000])
 def test_sums_have_the_same_bits_however_many_ticks_are_reckoned_at_once(cells: int) -> None:
-    """The TMC reckons as many ticks as have come in; a log must not show how many those were."""
+    """The TMC computes as many ticks as have come in; a log must not show how many those were."""
     law = UncertaintyLaw(np.random.default_rng(cells).choice([0.01, 0.2, 0.003], cells), 64)
     maps = np.random.default_rng(1).integers(0, 10, (54, cells)).astype(np.uint16)
     ticks = np.arange(10, 64)

@@ -1,4 +1,4 @@
-"""Two logs compared fact by fact: every kind of change is found where it is; what the schedule changes is no fact."""
+"""Two logs compared fact by fact: each kind of change is found where it is; what depends on time is not compared."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_what_one_log_lacks_is_a_difference(original: Path, tmp_path: Path) -> N
 
 
 def test_what_the_schedule_changes_is_no_fact(original: Path, tmp_path: Path) -> None:
-    """Lives, waits, how ticks are batched, and repeats of a record."""
+    """Incarnations, waits, how ticks are batched, and repeats of a record."""
 
     def change(name: str, message: Any) -> Iterator[Any]:
         if name == "/tmc/metrics":

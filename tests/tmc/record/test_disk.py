@@ -95,7 +95,7 @@ def test_two_that_resume_at_once_do_not_both_get_it(tmp_path: Path) -> None:
 
 
 @contextmanager
-def nobody_may_write(folder: Path) -> Iterator[None]:
+def unwritable(folder: Path) -> Iterator[None]:
     """The folder is read-only; root gives up its rights for a while, since it may write everywhere."""
     folder.chmod(0o555)
     root = os.geteuid() == 0
@@ -111,7 +111,7 @@ def nobody_may_write(folder: Path) -> Iterator[None]:
 
 @pytest.fixture
 def shared() -> Iterator[Path]:
-    """A folder that everybody may read, and new files in it: pytest's own are closed to all but its user."""
+    """A folder that all users may read, and new files in it: pytest's own are closed to all but its user."""
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o755)
         folder = Path(name) / "run"
@@ -141,7 +141,7 @@ def test_a_read_only_folder_is_said_and_keeps_its_logs(shared: Path) -> None:
     log.flush()
     log._give_up()
     whole = log.active.read_bytes()
-    with nobody_may_write(shared):
+    with unwritable(shared):
         for refused in (
             lambda: LogWriter(shared / "learner.mcap", "learner", JournalConfig(), {}),
             lambda: LogWriter(shared / "tmc.mcap", "tmc", JournalConfig(), {}, resume=True),

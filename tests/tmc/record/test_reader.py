@@ -203,7 +203,7 @@ def test_run_files(tmp_path):
     ]
     for name in names:
         (tmp_path / name).touch()
-    os.mkfifo(tmp_path / "uav-011.mcap")  # whoever opened it to read would wait for ever
+    os.mkfifo(tmp_path / "uav-011.mcap")  # a process that opened it to read would wait for ever
     (tmp_path / "uav-012.mcap").mkdir()
     found = {process: path.name for process, path in run_files(tmp_path).items()}
     assert list(found.items()) == [

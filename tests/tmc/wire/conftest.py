@@ -47,14 +47,14 @@ def any_message(valid: Callable[[type[Message]], st.SearchStrategy[Message]]) ->
 
 @pytest.fixture(scope="session")
 def same() -> Callable[[Message, Message], bool]:
-    """Whether two messages are alike in class, values, types and shapes."""
+    """Whether two messages are equal in class, values, types and shapes."""
 
-    def alike(a: Any, b: Any) -> bool:
+    def same_message(a: Any, b: Any) -> bool:
         if isinstance(a, np.ndarray):
             return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
         return type(a) is type(b) and a == b
 
     def compare(a: Message, b: Message) -> bool:
-        return type(a) is type(b) and all(alike(getattr(a, n), getattr(b, n)) for n in fields.rules(type(a)))
+        return type(a) is type(b) and all(same_message(getattr(a, n), getattr(b, n)) for n in fields.rules(type(a)))
 
     return compare

@@ -1,4 +1,4 @@
-"""What a mission will send is held against the rules of the messages before it starts; no rule's number is repeated."""
+"""What a mission will send is compared with the rules of the messages before it starts; no number is repeated."""
 
 from __future__ import annotations
 

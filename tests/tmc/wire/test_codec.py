@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tmc.wire.codec import HEADER_LIMIT, CodecError, decode, encode
+from tmc.wire.codec import HEADER_LIMIT_BYTES, CodecError, decode, encode
 from tmc.wire.messages import EMPTY, MESSAGES, PROTOCOL, Error, Map, Message, Minibatch, Policy, PolicyRequest, Status
 
 QUICK = settings(max_examples=60, deadline=None)
@@ -167,12 +167,12 @@ def test_keys_are_strings(raw: bytes) -> None:
 
 
 def test_a_header_over_the_limit_is_not_unpacked() -> None:
-    too_long = header(type="Policy", version=1, junk=bytes(HEADER_LIMIT))
+    too_long = header(type="Policy", version=1, junk=bytes(HEADER_LIMIT_BYTES))
     tracemalloc.start()
     assert refused([too_long]).code == "malformed"
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < HEADER_LIMIT / 4
+    assert peak < HEADER_LIMIT_BYTES / 4
 
 
 @pytest.mark.parametrize("kind", ["list", "map"])

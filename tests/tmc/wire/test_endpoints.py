@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from tmc.wire import endpoints, sockets
-from tmc.wire.endpoints import LONGEST_PATH, Endpoint, EndpointError, parse
+from tmc.wire.endpoints import MAX_PATH_BYTES, Endpoint, EndpointError, parse
 from tmc.wire.messages import PolicyRequest
 
 USES: dict[str, Callable[[str], object]] = {
@@ -99,13 +99,13 @@ def test_a_path_that_no_socket_can_have_is_refused(
     use: Callable[[str], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert f"a socket's may have {LONGEST_PATH}" in refused(use, "ipc://" + "x" * (LONGEST_PATH + 1))
+    assert f"a socket's may have {MAX_PATH_BYTES}" in refused(use, "ipc://" + "x" * (MAX_PATH_BYTES + 1))
     assert "there is no folder nowhere" in refused(use, "ipc://nowhere/sync")
     (tmp_path / "thesis.txt").write_text("three years of work")
     for path in ("thesis.txt", ".", "*"):
         assert "is not a socket" in refused(use, f"ipc://{path}")
-    assert use("ipc://" + "x" * LONGEST_PATH)
-    assert use("ipc://@" + "x" * (LONGEST_PATH - 1))
+    assert use("ipc://" + "x" * MAX_PATH_BYTES)
+    assert use("ipc://@" + "x" * (MAX_PATH_BYTES - 1))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -160,7 +160,7 @@ def test_a_client_says_whether_anything_listens_where_it_waits() -> None:
     endpoint = f"tcp://127.0.0.1:{port}"
     assert "nothing listens so far" in sockets.waiting(endpoint)
     with socket.create_server(("127.0.0.1", port)):
-        assert "something listens and does not answer" in sockets.waiting(endpoint)
+        assert "a process listens but does not answer" in sockets.waiting(endpoint)
 
 
 def test_looking_whether_an_endpoint_is_free_leaves_no_file(tmp_path: Path) -> None:

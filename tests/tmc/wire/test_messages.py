@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from tmc.wire import fields
 from tmc.wire import messages as m
 from tmc.wire.codec import decode, encode
+from tmc.wire.fields import FRAME_LIMIT_BYTES
 from tmc.wire.messages import EMPTY, MESSAGES, Message
-from tmc.wire.sockets import PART_LIMIT
 
 QUICK = settings(max_examples=15, deadline=None)
 Valid = Callable[[type[Message]], st.SearchStrategy[Message]]
@@ -226,7 +226,7 @@ def test_the_longest_message_of_a_kind_can_be_decoded(cls: type[Message], same: 
 def test_the_longest_frame_of_a_field_fits_the_sockets(cls: type[Message], name: str, rule: fields.Rule) -> None:
     """A larger one is dropped on arrival, and the client that it was for never hears of the TMC again."""
     size = np.dtype(rule.dtype).itemsize if rule.kind == "tensor" else 1
-    assert rule.high * size <= PART_LIMIT
+    assert rule.high * size <= FRAME_LIMIT_BYTES
 
 
 def test_codes_of_field_errors_are_codes_of_the_error_reply() -> None:

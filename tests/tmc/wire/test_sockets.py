@@ -187,7 +187,7 @@ def test_a_new_process_takes_over_its_name(radio: Radio, endpoint: str) -> None:
 # What cannot be sent
 
 
-def test_a_message_to_nobody_is_not_sent(radio: Radio, endpoint: str) -> None:
+def test_a_message_to_no_client_is_not_sent(radio: Radio, endpoint: str) -> None:
     bound = radio.router(endpoint)
     assert sockets.send(bound, Ack(1), to=b"uav-009") is False
     client = radio.dealer(endpoint, "uav-009")
@@ -224,7 +224,7 @@ def test_an_oversize_part_is_dropped_and_the_others_go_on(radio: Radio, endpoint
     with radio.stranger(endpoint, b"evil") as evil:
         evil.send_multipart([b"small"])
         assert wait(bound) == [b"evil", b"small"]
-        evil.send(bytes(sockets.PART_LIMIT + 1), copy=False)
+        evil.send(bytes(sockets.FRAME_LIMIT_BYTES + 1), copy=False)
         for _ in range(20):
             meet(bound, client, b"uav-000")
         assert not bound.poll(200)
@@ -232,11 +232,11 @@ def test_an_oversize_part_is_dropped_and_the_others_go_on(radio: Radio, endpoint
 
 
 def test_an_oversize_part_from_the_other_side_does_not_reach_a_client(radio: Radio, ipc: str) -> None:
-    """ZeroMQ gives that connection up for good: a socket opened anew gets through, and nobody else notices."""
+    """ZeroMQ gives that connection up: a new socket gets through, and no other client notices."""
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
     other = radio.dealer(ipc, "uav-001")
-    bound.send_multipart([b"uav-000", bytes(sockets.PART_LIMIT + 1)], copy=False)
+    bound.send_multipart([b"uav-000", bytes(sockets.FRAME_LIMIT_BYTES + 1)], copy=False)
     assert not client.poll(300)
     meet(bound, other, b"uav-001")
     meet(bound, radio.dealer(ipc, "uav-000"), b"uav-000")
@@ -245,7 +245,7 @@ def test_an_oversize_part_from_the_other_side_does_not_reach_a_client(radio: Rad
 def test_frames_that_are_no_message_do_not_break_the_socket(radio: Radio, ipc: str) -> None:
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
-    for junk in ([b""], [b"\xc1"], [b"x"] * (sockets.PARTS + 1), [*encode(Ack(1)), b"more"], [b"\x80"] * 100):
+    for junk in ([b""], [b"\xc1"], [b"x"] * (sockets.MAX_FRAMES + 1), [*encode(Ack(1)), b"more"], [b"\x80"] * 100):
         bound.send_multipart([b"uav-000", *junk])
         assert client.poll(PATIENCE_MS)
         with pytest.raises(CodecError):
@@ -256,9 +256,9 @@ def test_frames_that_are_no_message_do_not_break_the_socket(radio: Radio, ipc: s
 def test_too_many_frames_are_counted_before_they_are_read(radio: Radio, ipc: str) -> None:
     bound, client = radio.router(ipc), radio.dealer(ipc, "uav-000")
     meet(bound, client, b"uav-000")
-    bound.send_multipart([b"uav-000", *encode(Ack(1)), *[b"x"] * sockets.PARTS])
+    bound.send_multipart([b"uav-000", *encode(Ack(1)), *[b"x"] * sockets.MAX_FRAMES])
     assert client.poll(PATIENCE_MS)
-    with pytest.raises(CodecError, match=rf"{sockets.PARTS + 1} frames, at most {sockets.PARTS}"):
+    with pytest.raises(CodecError, match=rf"{sockets.MAX_FRAMES + 1} frames, at most {sockets.MAX_FRAMES}"):
         sockets.receive_message(client)
 
 
@@ -282,7 +282,7 @@ def test_options_follow_what_was_measured(radio: Radio) -> None:
     bound, client = radio.router(endpoint), radio.dealer(endpoint, "uav-000")
     for sock in (bound, client):
         assert sock.getsockopt(zmq.LINGER) == 0
-        assert sock.getsockopt(zmq.MAXMSGSIZE) == sockets.PART_LIMIT
+        assert sock.getsockopt(zmq.MAXMSGSIZE) == sockets.FRAME_LIMIT_BYTES
     assert bound.getsockopt(zmq.RCVHWM) == 32
     assert client.getsockopt(zmq.HEARTBEAT_IVL) == 1000
 
@@ -370,7 +370,7 @@ def test_what_is_no_endpoint_cannot_be_bound(bad: str, radio: Radio) -> None:
 
 
 def test_a_port_that_does_not_exist_is_refused(radio: Radio) -> None:
-    """ZeroMQ alone takes the port modulo 65,536, so that nobody finds the TMC."""
+    """ZeroMQ alone takes the port modulo 65,536, so that no client finds the TMC."""
     with pytest.raises(EndpointError):
         radio.router("tcp://127.0.0.1:99999")
 
@@ -395,8 +395,8 @@ def test_what_is_no_endpoint_cannot_be_connected_to(bad: str, radio: Radio) -> N
         ("tcp://127.0.0.1:5555", "tcp://127.0.0.1:5556"),
         ("tcp://*:1", "tcp://*:2"),
         ("tcp://[::1]:65534", "tcp://[::1]:65535"),
-        ("ipc:///run/overfly/sync", "ipc:///run/overfly/sync.feed"),
-        ("ipc://@abstract", "ipc://@abstract.feed"),
+        ("ipc:///run/overfly/sync", "ipc:///run/overfly/sync.learner"),
+        ("ipc://@abstract", "ipc://@abstract.learner"),
     ],
 )
 def test_the_learners_endpoint_stands_beside_that_of_the_uavs(sync: str, feed: str) -> None:

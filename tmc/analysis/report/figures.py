@@ -118,7 +118,7 @@ def _blocked_curve(axes: Any, summary: Summary) -> None:
 def _learning_curve(axes: Any, learning: Learning) -> None:
     """Draw the loss on the left axis, logarithmic, and Q values on the right axis."""
     x = _thin(learning.updates)
-    axes.set(title="Learning", xlabel="updates of the network", ylabel="loss per minibatch")
+    axes.set(title="Learning", xlabel="updates of the network", ylabel="minibatch loss")
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     style.plain(axes)
     if not x.size:

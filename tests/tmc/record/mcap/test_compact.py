@@ -1,4 +1,4 @@
-"""Sealing: all that a run's logs hold in larger chunks and under finished names, or the logs as they were."""
+"""Compacting: all that a run's logs hold in larger chunks and under finished names, or the logs as they were."""
 
 from __future__ import annotations
 

@@ -333,7 +333,7 @@ def test_a_recovered_log_is_resumed_with_its_gap(wholes: dict[bool, Whole], tmp_
 
 def test_what_cannot_be_recovered_is_said_and_leaves_nothing(wholes: dict[bool, Whole], tmp_path: Path) -> None:
     text = tmp_path / "text.mcap"
-    text.write_text("hello, world, this is no log at all; " * 100)
+    text.write_text("hello, world, this is not a log at all; " * 100)
     with pytest.raises(RecordError, match="holds nothing that is intact: it is not an MCAP file"):
         recover(text)
     with pytest.raises(RecordError, match=r"cannot be read \(No such file"):
