@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Parse the options of commands and child processes: no abbreviations, and printable errors."""
-=======
 """The options of every command and child process: whole words only, and one sentence for what is wrong."""
->>>>>>> 849b037a95780f30431bc7cc1a41e89a347e6f2a
 
 from __future__ import annotations
 
@@ -15,14 +11,10 @@ from tmc.wire.process import ERROR, USAGE
 
 
 class Options(argparse.ArgumentParser):
-<<<<<<< HEAD
-    """A parser without abbreviations, since a new option could change their meaning."""
-=======
     """A parser whose errors are one sentence that names the nearest option or name that exists.
 
     It takes no abbreviation, which the next new option could turn into another; nor do its subcommands.
     """
->>>>>>> 849b037a95780f30431bc7cc1a41e89a347e6f2a
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{"allow_abbrev": False, **kwargs})
@@ -64,11 +56,6 @@ class Options(argparse.ArgumentParser):
         self.error(f"{what}: {suggestion(str(value), known)}")
 
     def error(self, message: str) -> NoReturn:
-<<<<<<< HEAD
-        """Print the error on one line, and exit with code 2."""
-        super().error(printable(message))
-=======
         """Print what is wrong on one line, with the command that lists the options, and exit with code 2."""
         text = printable(message)
         self.exit(USAGE, f"{ERROR}{text}{'' if text.endswith('?') else ';'} see `{self.prog} --help`\n")
->>>>>>> 849b037a95780f30431bc7cc1a41e89a347e6f2a
