@@ -1,4 +1,4 @@
-"""Parse the options of commands and child processes: whole words only, and one sentence for what is wrong."""
+"""The options of every command and child process: whole words only, and one sentence for what is wrong."""
 
 from __future__ import annotations
 
