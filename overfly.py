@@ -181,7 +181,7 @@ def fly(
     _command: str = "",
     **settings: Unpack[Settings],
 ) -> Run:
-    """Fly a fixed policy or a planner, as `overfly fly WHO` does; deterministic.
+    """Fly a fixed policy or a planner, as `overfly fly POLICY` does; deterministic.
 
     `who`: a policy file, a run folder, or `planner:random`, `planner:random-road`, `planner:greedy`. A run folder
     brings its settings along; otherwise those of the paper hold. One episode unless `episodes` says otherwise. All else
@@ -244,7 +244,7 @@ def evaluate(
     quiet: bool = False,
     **settings: Unpack[EvaluationSettings],
 ) -> Table:
-    """Compare policies and planners, as `overfly evaluate WHO...` does: `seeds` missions of one episode each.
+    """Compare policies and planners, as `overfly evaluate POLICY...` does: `seeds` missions of one episode each.
 
     `whos`: one or several, each as for `fly`; a run folder brings its world along for all of them. `actors`: a team
     size, or several; by default that of the settings. `jobs`: processes to use, one for each core by default. Raises

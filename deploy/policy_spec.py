@@ -1,4 +1,4 @@
-"""WHO flies: a policy file, a run folder, or a planner."""
+"""Find who flies: a policy file, a run folder, or a planner."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class PolicySpec:
 
 
 def resolve(name: str, say: Callable[[str], None] = process.tell) -> PolicySpec:
-    """Find WHO; raises ConfigError with what may be written, or PolicyError for a file that is no policy.
+    """Find a policy or planner by name; `say` takes a sentence on each setting of a run folder that was edited since.
 
-    `say` takes a sentence on each setting of a run folder that was edited since.
+    Raises ConfigError with what may be written, or PolicyError if a file does not hold a policy.
     """
     if name.startswith(PREFIX):
         if name.removeprefix(PREFIX) not in PLANNERS:
@@ -59,7 +59,7 @@ def _of_run(folder: Path, say: Callable[[str], None]) -> PolicySpec:
     """The final policy of a run, in the mission that it was trained for."""
     journal, policy = RunFolder(folder).existing_journal(), RunFolder(folder).final_policy
     if journal is None and not RunFolder(folder).config.exists():
-        raise ConfigError(f"{folder} is no run folder: it has no config.json")
+        raise ConfigError(f"{folder} is not a run folder: it has no config.json")
     settings = settings_of(folder, journal)
     for note in settings.notes:
         say(f"{folder}: {note}")
@@ -89,8 +89,8 @@ def _of_file(name: str, path: Path, values: dict[str, Any]) -> PolicySpec:
     except PolicyError as error:
         raise PolicyError(f"{plain(path)}: {error}") from None
     except OSError as error:
-        mend = "give a policy file, a run folder or a planner"
-        raise PolicyError(f"{plain(path)} cannot be read ({error.strerror}): {mend}") from None
+        fix = "give a policy file, a run folder or a planner"
+        raise PolicyError(f"{plain(path)} cannot be read ({error.strerror}): {fix}") from None
     return PolicySpec(name, model, values | view_of(card) | {"team.controller": "policy"})
 
 

@@ -137,7 +137,7 @@ ERRORS: tuple[tuple[Callable[[], object], type[overfly.Error], str], ...] = (
     (lambda: overfly.train(actor=3), overfly.ConfigError, "train takes no 'actor': did you mean actors?"),  # type: ignore[call-arg]
     (lambda: overfly.fly("planner:greedy", batch_size=3), overfly.ConfigError, '"dqn.batch_size"'),  # type: ignore[call-arg]
     (lambda: overfly.fly("planner:greedy", settings={"gamma": 1}), overfly.ConfigError, "did you mean dqn.gamma"),
-    (lambda: overfly.fly("nowhere.onnx"), overfly.ConfigError, "no policy file and no run folder"),
+    (lambda: overfly.fly("nowhere.onnx"), overfly.ConfigError, "not a policy file, a run folder or a planner"),
     (lambda: overfly.evaluate([]), overfly.ConfigError, "nothing to evaluate"),
     (lambda: overfly.evaluate("planner:greedy", seeds=0), overfly.ConfigError, "seeds = 0"),
     (lambda: overfly.open_run("nowhere"), overfly.RecordError, "holds no logs of a run"),

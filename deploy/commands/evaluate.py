@@ -1,4 +1,4 @@
-"""`overfly evaluate WHO...`: policies and planners side by side, many seeds each, in lock step."""
+"""`overfly evaluate POLICY...`: policies and planners side by side, many seeds each, in lock step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from tmc.wire import process
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("who", nargs="+", help="policy files, run folders, planner:random, planner:random-road, ...")
+    parser.add_argument(
+        "who", nargs="+", metavar="POLICY", help="policy files, run folders, planner:random, planner:random-road, ..."
+    )
     parser.add_argument("--actors", default=None, metavar="N[,N...]", help="team sizes (default: the mission's)")
     parser.add_argument("--seeds", type=int, default=10, metavar="S", help="missions each (default: 10)")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED, metavar="S", help="default: %(default)s")
@@ -55,4 +57,4 @@ def team_sizes(listed: str | None) -> list[int | None]:
     try:
         return [None] if listed is None else [*dict.fromkeys(int(n) for n in listed.split(","))]
     except ValueError:
-        raise ConfigError(f"--actors {listed} is no list of numbers: write for example --actors 1,3,10") from None
+        raise ConfigError(f"--actors {listed} is not a list of numbers: write for example --actors 1,3,10") from None

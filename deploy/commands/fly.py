@@ -1,4 +1,4 @@
-"""`overfly fly WHO`: a mission with a fixed policy or a planner in real processes; deterministic."""
+"""`overfly fly POLICY`: a mission with a fixed policy or a planner in real processes; deterministic."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from deploy.run import mission
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("who", help="policy file, run folder, or planner:random, planner:random-road, planner:greedy")
+    parser.add_argument(
+        "who", metavar="POLICY", help="policy file, run folder, or planner:random, planner:random-road, planner:greedy"
+    )
     settings.add_options(parser, defaults=policy_spec.ONE_EPISODE)
     add_mission_options(parser)
 

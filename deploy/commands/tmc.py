@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("preset", nargs="?", default="paper", help="settings to start from (default: paper)")
     parser.add_argument("--bind", default="tcp://127.0.0.1:5555", metavar="ENDPOINT",
                         help="endpoint for UAVs; the learner uses the next port (default: %(default)s)")  # fmt: skip
-    parser.add_argument("--fly", metavar="WHO", help="fly a fixed policy or a planner; there is no learner")
+    parser.add_argument("--fly", metavar="POLICY", help="fly a fixed policy or a planner; there is no learner")
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/tmc-<time>)")
     parser.add_argument("--resume", type=Path, metavar="RUN", help="resume the mission whose journal is there")
     settings.add_options(parser)

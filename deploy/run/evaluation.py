@@ -22,7 +22,7 @@ from tmc.kernel.world import World
 FIRST_SEED = 1_000_000
 """Seeds of an evaluation start here, far from those that people train with."""
 WORLD = ("scenario", "team.size", "team.sensing_range", "comms.period", "comms.phase", "training.ticks")
-"""What a run brings along for everybody that it is compared with, beside `world.*`."""
+"""What a run brings along for all that it is compared with, beside `world.*`."""
 T_975 = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131,
     2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
@@ -105,7 +105,7 @@ def evaluate(
 def missions(
     whos: Iterable[str], chosen: Mapping[str, Any], teams: Sequence[int], seeds: range, say: Say
 ) -> Iterator[tuple[str, Config, bytes | None]]:
-    """(WHO, config, policy) of every mission, checked before the first one flies."""
+    """Yield (name, config, policy) of every mission, checked before the first one flies."""
     sizes: list[int | None] = [*teams] or [None]
     pilots = [policy_spec.resolve(name, say) for name in dict.fromkeys(whos)]
     shared = shared_world(pilots, {*chosen, *(["team.size"] if teams else [])})
@@ -119,8 +119,10 @@ def missions(
 
 
 def shared_world(pilots: list[policy_spec.PolicySpec], chosen: Collection[str] = ()) -> dict[str, Any]:
-    """The world of the run folders among WHO, for everybody in the table; ConfigError when they do not agree on what
-    is not `chosen` for all of them."""
+    """Return the world of the run folders among `pilots`, for all rows of the table.
+
+    Raises ConfigError if they do not agree on what is not `chosen` for all of them.
+    """
     worlds = [{k: v for k, v in p.values.items() if k in WORLD or k.startswith("world.")} for p in pilots]
     worlds = [world for world in worlds if world]
     for world in worlds[1:]:
@@ -177,7 +179,7 @@ def _progress(flights: Iterable[MissionResult], total: int, show: Say) -> Iterat
 
 
 def table(flights: Iterable[MissionResult]) -> list[Row]:
-    """One row for each WHO and N, in the order flown."""
+    """Return one row for each policy or planner and N, in the order flown."""
     groups: dict[tuple[str, int], list[MissionResult]] = {}
     for flight in flights:
         groups.setdefault((flight.who, flight.actors), []).append(flight)

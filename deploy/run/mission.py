@@ -118,8 +118,8 @@ def require_settings(out: Path) -> Config:
     settings = settings_of(out, journal)
     if settings.edited:
         keys = ", ".join(settings.edited)
-        mend = "put it back, or remove the file and the log's settings are used; other settings need a run of their own"
-        raise ConfigError(f"{RunFolder(out).config} was edited since the run was begun, in {keys}: {mend}")
+        fix = "put it back, or remove the file and the log's settings are used; other settings need a run of their own"
+        raise ConfigError(f"{RunFolder(out).config} was edited since the run was begun, in {keys}: {fix}")
     return settings.config
 
 

@@ -202,7 +202,7 @@ class Mission:
         elif isinstance(message, m.End):
             self.home.add(i)
         elif isinstance(message, m.Beacon) and isinstance(pilot.airspace.tracks, RadioTracks):
-            pilot.airspace.tracks.hear(message)
+            pilot.airspace.tracks.on_beacon(message)
         if isinstance(message, m.Error):
             assert self.restarts and message.code == "state", message.text
             answer = m.Hello(role="uav", uav=i, incarnation=self.incarnations[i])
@@ -226,7 +226,7 @@ class Mission:
                 continue
             tracks = pilot.airspace.tracks
             if i in self.waits and isinstance(tracks, RadioTracks):
-                tracks.ask(self.waits[i].peer)
+                tracks.request_track(self.waits[i].peer)
                 self.asked += 1
             if pilot.phase is Phase.MAP and pilot.pending is not None:
                 self.up[i].append(pilot.pending)

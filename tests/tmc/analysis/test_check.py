@@ -110,7 +110,7 @@ def lose_one(folder: Path, dies: int, **values: Any) -> Path:
             for i, member in enumerate(station.roster):
                 member.heard = member.heard if i == 2 and away else now
             station.tick(now)
-            deliver(step._take())
+            deliver(step._collect())
     journal.writer.close()
     return folder
 

@@ -325,7 +325,7 @@ def test_a_team_of_which_some_or_all_are_missing_is_summed_up_and_drawn(ticks, t
         now += 100.0
         station.roster[0].heard = now if station.episodes == 0 or ticks else 0.0
         station.tick(now)
-        for to, message in mission._take():
+        for to, message in mission._collect():
             mission.fleet.deliver(to, message)
     journal.writer.close()
     s = summary(tmp_path)

@@ -351,7 +351,7 @@ def losing(mission: LockStep) -> None:
             for i, member in enumerate(station.roster):
                 member.heard = now if i != 1 else member.heard
             station.tick(now)
-            for uav, reply in mission._take():
+            for uav, reply in mission._collect():
                 if uav != 1:
                     fleet.deliver(uav, reply)
         assert now < 10_000, "the mission hangs"

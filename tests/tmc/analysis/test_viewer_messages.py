@@ -52,6 +52,6 @@ def test_the_layout_is_filled_in_for_each_uav_and_drops_what_is_not_there():
     assert belief["cameraState"]["distance"] == pytest.approx(1980.0)
     lines = made["configById"]["Plot!uncertainty"]["paths"]
     assert [(line["value"], line["color"], line["label"]) for line in lines[:-2]] == [
-        ("/uav/1/tick.believed_per_cell", "#222222", "as UAV 1 knows it")
+        ("/uav/1/tick.believed_per_cell", "#222222", "map of UAV 1")
     ]
     assert "<" not in json.dumps(made)

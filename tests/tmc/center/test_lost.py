@@ -76,7 +76,7 @@ class Losing:
                     if not (i == LOST and self.dead):
                         member.heard = now
                 self.step.station.tick(now)
-                self.deliver(self.step._take())
+                self.deliver(self.step._collect())
         return self
 
 

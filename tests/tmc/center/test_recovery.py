@@ -528,7 +528,7 @@ def test_map_and_replay_from_a_sealed_log_alone_are_those_of_the_tmc(
     assert result.good and next(row.facts for row in result.rows if row.name == "state") == 9
     told = [e.message for e in Log(path).entries(["/tmc/state"])]
     assert told[-1].replay == flown.station.replay.digest() and len({s.map for s in told}) == 3
-    for name, what in (("map", "the maps are others"), ("replay", "the replay memory is another")):
+    for name, what in (("map", "the maps differ"), ("replay", "the replay memory differs")):
         entries = list(flown.entries)
         n = at(entries, "/tmc/state", 1)
         entries[n] = JournalEntry("/tmc/state", entries[n].values | {name: told[0].map})

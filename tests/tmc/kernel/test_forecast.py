@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -68,8 +69,8 @@ class Counting:
         self.version += 1
         return self.version, b"model"
 
-    def take_td_errors(self) -> tuple[()]:
-        return ()
+    def take_td_errors(self) -> tuple[Any, Any]:
+        return np.zeros(0, np.int64), np.zeros(0, np.float32)
 
 
 class Stay:

@@ -18,7 +18,7 @@ UNKNOWN = -1
 
 
 @dataclass(frozen=True)
-class Record:
+class RecordHead:
     """One flight record without its arrays.
 
     `version`: of the map in the record. `given`: of the map that the UAV got last, at an exchange or
@@ -91,7 +91,7 @@ class EpisodeLog:
         self.cells, self.actions, self.blocks = (np.full(shape, UNKNOWN, np.int64) for _ in range(3))
         self.own = np.full(shape, np.nan)
         self.seen: list[tuple[list[int], list[int]]] = [([], []) for _ in range(self.N)]
-        self.records: list[Record] = []
+        self.records: list[RecordHead] = []
         self.syncs: list[Sync] = []
         self.metrics: list[Metrics] = []
         self.events: list[tuple[int, int]] = []
@@ -161,7 +161,7 @@ class EpisodeCollector:
             return
         before, i = self.before, m.uav
         answered = next((s.version for s in reversed(e.syncs) if i in s.uavs), e.before.version)
-        e.records.append(Record(i, m.sequence, m.first, m.tick, m.version, answered))
+        e.records.append(RecordHead(i, m.sequence, m.first, m.tick, m.version, answered))
         before.sequence[i] = m.sequence + 1
         e.reported[i] = max(e.reported[i], m.tick)
         moves = slice(max(m.first, 1), m.tick + 1)
