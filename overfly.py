@@ -405,8 +405,11 @@ class Run:
         """
         import numpy as np
 
+        from tmc.record import overfly_pb2
+        from tmc.record.queries import messages
+
         newest: dict[int, int] = {}
-        for m in self._logged("overfly.FlightRecord"):
+        for m in messages(self.folder, overfly_pb2.FlightRecord):
             if m.sequence <= newest.get(m.uav, -1):  # a TMC that was started again may have logged it twice
                 continue
             newest[m.uav] = m.sequence
@@ -414,11 +417,6 @@ class Run:
                 cells, actions, blocks = (np.array(values[:], np.int64) for values in (m.cells, m.actions, m.blocks))
                 rewards = np.array(m.rewards[:], np.float64)
                 yield FlightRecord(m.uav, m.episode, m.first, cells, actions, blocks, rewards)
-
-    def _logged(self, schema: str) -> Iterator[Any]:
-        from tmc.record.queries import messages
-
-        return messages(self.folder, schema)
 
     def messages(self, *topics: str) -> Iterator[LogMessage]:
         """Messages of all logs of the run, one log after the other, of these topics only when given.

@@ -31,7 +31,8 @@ from tmc.center.replay import Replay
 from tmc.kernel import observation
 from tmc.kernel.config import Config, ConfigError, flat
 from tmc.kernel.world import World
-from tmc.record.reader import Log, decode
+from tmc.record.overfly_pb2 import LearnerMetrics
+from tmc.record.reader import Log
 from tmc.record.run_folder import run_files
 from tmc.wire import messages, process
 from tmc.wire.messages import Minibatch
@@ -188,7 +189,7 @@ def _cpu(pids: Mapping[str, int]) -> dict[str, float]:
 def _idle(out: Path, seconds: float) -> float | None:
     """Return the mean idle share that the learner logged in the last `seconds`."""
     path = run_files(out).get("learner")
-    logged = [decode(raw) for raw in Log(path).raw() if raw.topic == "/learner/metrics"] if path else []
+    logged = [*Log(path).messages(LearnerMetrics)] if path else []
     shares = [metrics.idle_share for metrics in logged if metrics.wall > logged[-1].wall - seconds]
     return sum(shares) / len(shares) if shares else None
 

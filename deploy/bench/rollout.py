@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from deploy import policy_spec, settings
 from deploy.bench import bounds
@@ -31,8 +30,11 @@ from deploy.run.supervisor import Supervisor
 from tmc.center.journal import Journal
 from tmc.kernel.config import Config, build, flat
 from tmc.kernel.world import World
+from tmc.record.mcap.parser import Message as LoggedMessage
+from tmc.record.overfly_pb2 import TeamMetrics, UavStatus
 from tmc.record.reader import Log, decode
 from tmc.record.run_folder import RunFolder, run_files
+from tmc.record.schemas import foxglove
 from tmc.wire import process
 
 TRANSPORTS = {"table": (True,), "beacons": (False,), "both": (True, False)}
@@ -229,9 +231,9 @@ def _read(out: Path, config: Config, start: int, memory: Memory | None = None) -
     times, beacons = [], 0
     for raw in Log(files["tmc"]).raw():
         if raw.topic == "/tmc/metrics":
-            times.append((raw.log_time, decode(raw).elapsed))
+            times.append((raw.log_time, decode(raw, TeamMetrics).elapsed))
         elif raw.topic == "/log":
-            count = re.search(r"\bBeacon ([0-9]+)", decode(raw).message)
+            count = re.search(r"\bBeacon ([0-9]+)", decode(raw, foxglove("Log").Log).message)
             beacons += int(count[1]) if count else 0
     steps = config.team.size * config.training.ticks * config.training.episodes
     seconds = times[-1][1] - times[0][1]
@@ -249,10 +251,10 @@ def _waits(files: list[Path], begin: int) -> float | None:
     """Return the mean share of time that UAVs waited for peers, by the last status of each; None without one."""
     shares = []
     for file in files:
-        last: Any = None
+        last: LoggedMessage | None = None
         for raw in Log(file).raw():
             if raw.schema == "overfly.UavStatus":
                 last = raw
         if last is not None and last.log_time - begin > 2e8:  # a status in the first moments means nothing
-            shares.append(decode(last).waited / ((last.log_time - begin) / 1e9))
+            shares.append(decode(last, UavStatus).waited / ((last.log_time - begin) / 1e9))
     return sum(shares) / len(shares) if shares else None

@@ -31,6 +31,7 @@ from deploy.run.plan import ROOT
 from deploy.run.supervisor import MissionFailed
 from tmc.record import reader
 from tmc.record.errors import RecordError
+from tmc.record.overfly_pb2 import LearnerMetrics
 from tmc.wire import messages, process, sockets
 from tmc.wire.codec import decode
 
@@ -150,7 +151,7 @@ def _first_update(log: Path) -> int | None:
         return None
     if first is None:
         return None
-    assert reader.decode(first).updates == 1
+    assert reader.decode(first, LearnerMetrics).updates == 1
     return first.log_time
 
 

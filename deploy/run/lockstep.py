@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from actors.fleet import Fleet
 from actors.observation_hash import ObservationHasher
@@ -191,7 +191,7 @@ def _hash_logs(world: World, out: Path) -> Iterator[KeepHashes | None]:
         facts = {"run": RUN}
         logs = [stack.enter_context(LogWriter(out / f"{n}.mcap", n, config.journal, facts)) for n in names]
 
-        def keep_hashes(uav: int, message: Any) -> None:
+        def keep_hashes(uav: int, message: ObservationHashes) -> None:
             logs[uav].write(uav_topic(uav, "observation_hash"), message)
 
         yield keep_hashes

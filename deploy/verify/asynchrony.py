@@ -19,8 +19,8 @@ from tmc.kernel.config import Config, ConfigError, build
 from tmc.kernel.grid import Grid
 from tmc.kernel.world import World
 from tmc.record import compare
-from tmc.record.channels import uav_topic
-from tmc.record.reader import read
+from tmc.record.overfly_pb2 import UavStatus
+from tmc.record.reader import Log
 from tmc.record.run_folder import run_files
 
 SIDE_CELLS = 120
@@ -172,8 +172,8 @@ def farthest(config: Config, facts: compare.Facts, flight: Path, delayed_uav: in
     """Return the largest lead over the delayed UAV, by the logs of the UAVs."""
     found = []
     for uav in set(range(config.team.size)) - {delayed_uav}:
-        *_, last = read(run_files(flight)[f"uav-{uav:03d}"], [uav_topic(uav, "status")])
-        found.append((last.message.lead_most, uav, last.message.lead_tick, last.message.lead_bound))
+        *_, last = Log(run_files(flight)[f"uav-{uav:03d}"]).messages(UavStatus)
+        found.append((last.lead_most, uav, last.lead_tick, last.lead_bound))
     lead, uav, at, bound = max(found)
     chebyshev = Grid(SIDE_CELLS, SIDE_CELLS).chebyshev
     there = compare.cell(facts, 1, at - lead, delayed_uav)

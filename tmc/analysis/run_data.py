@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tmc.analysis.run_config import world_of
 from tmc.kernel.files import read_text
 from tmc.kernel.world import World
+from tmc.record import overfly_pb2
 from tmc.record.channels import ACTIVE
 from tmc.record.errors import RecordError
 from tmc.record.queries import Tracks
@@ -145,9 +146,9 @@ class _Collector:
 
     tracks: dict[int, Tracks] = field(default_factory=dict)
     blocks: dict[int, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
-    metrics: dict[int, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    metrics: dict[int, list[overfly_pb2.TeamMetrics]] = field(default_factory=lambda: defaultdict(list))
     events: dict[int, set[tuple[int, int]]] = field(default_factory=lambda: defaultdict(set))
-    ends: dict[int, Any] = field(default_factory=dict)
+    ends: dict[int, overfly_pb2.Episode] = field(default_factory=dict)
     learner: dict[int, tuple[float, ...]] = field(default_factory=dict)
     policies: dict[int, tuple[float, ...]] = field(default_factory=dict)
     known: set[tuple[int, int]] = field(default_factory=set)
@@ -170,31 +171,31 @@ class _Collector:
         still = f"{path.name}: not closed: its process is still running, or was killed"
         return [still] if path.name.endswith(ACTIVE) and not log.finished else []
 
-    def _record(self, m: Any) -> None:
+    def _record(self, m: overfly_pb2.FlightRecord) -> None:
         if (m.uav, m.sequence) not in self.known:
             self.known.add((m.uav, m.sequence))
             self.tracks.setdefault(m.episode, Tracks(m.episode)).add(m)
             self.blocks[m.episode].update(m.blocks)
 
-    def _metrics(self, m: Any) -> None:
+    def _metrics(self, m: overfly_pb2.TeamMetrics) -> None:
         self.updates = max(self.updates, m.updates)
         self.flying.update(m.elapsed)
         self.metrics[m.episode].append(m)
 
-    def _events(self, m: Any) -> None:
+    def _events(self, m: overfly_pb2.Events) -> None:
         self.events[m.episode].update(zip(m.ticks, m.cells, strict=True))
 
-    def _episode(self, m: Any) -> None:
+    def _episode(self, m: overfly_pb2.Episode) -> None:
         self.updates = max(self.updates, m.updates)
         if m.phase == "end":
             self.ends[m.episode] = m
 
-    def _learner(self, m: Any) -> None:
+    def _learner(self, m: overfly_pb2.LearnerMetrics) -> None:
         self.updates = max(self.updates, m.updates)
         self.learning.update(m.wall)
         self.learner[m.updates] = (m.loss, m.q_mean, m.target_mean)
 
-    def _policy(self, m: Any) -> None:
+    def _policy(self, m: overfly_pb2.Policy) -> None:
         self.updates = max(self.updates, m.updates)
         if m.updates:
             self.policies[m.updates] = (m.loss, np.nan, np.nan)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -73,8 +73,8 @@ def play(
     station.playing = True
     try:
         for raw in journal:
-            message: Any = decode(raw) if raw.schema in _TOLD else None
-            skipping = message.episode in skip if raw.schema == EPISODE else skipping
+            message = decode(raw) if raw.schema in _TOLD else None
+            skipping = message.episode in skip if isinstance(message, Episode) else skipping
             if not skipping or raw.schema == POLICY:
                 balance.written(raw.topic)
             if message is not None:
@@ -130,11 +130,12 @@ class _Balance:
 def skipped(log: Log, config: Config) -> range:
     """Return the episodes of which nothing is needed: neither transitions of the replay, nor the start of learning."""
     ended, lost = 0, set[int]()
-    for entry in log.entries(("/tmc/episode", "/tmc/lost")):
-        if entry.topic == "/tmc/lost":
-            lost.add(entry.message.episode)
-        elif entry.message.phase == "end":
-            ended = entry.message.episode
+    messages: Iterator[Episode | Lost] = log.messages(Episode, Lost)
+    for message in messages:
+        if isinstance(message, Lost):
+            lost.add(message.episode)
+        elif message.phase == "end":
+            ended = message.episode
     # Transitions by episode, of one UAV; around a loss some are left out, so such an episode counts as none.
     starts = [0 if e in lost else config.training.ticks for e in range(1, ended + 1)]
     team, needed = config.team.size, config.replay.learn_start

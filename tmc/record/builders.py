@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,7 +66,7 @@ def to_record(proto: FlightRecord) -> Record:
         ) from None
 
 
-def _array(values: Any, kind: str) -> NDArray[Any]:
+def _array(values: Sequence[float], kind: str) -> NDArray[Any]:
     try:
         return np.array(array(_CODES[kind], values[:]), kind)  # checks the range, and is faster than NumPy
     except OverflowError:

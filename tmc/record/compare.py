@@ -19,6 +19,7 @@ from tmc.record.errors import RecordError
 from tmc.record.overfly_pb2 import Episode, Events, FlightRecord, ObservationHashes, Sync, TeamMetrics
 from tmc.record.reader import Log, decode
 from tmc.record.run_folder import run_files
+from tmc.record.schemas import foxglove
 
 TEAM = -1
 """The UAV number in facts of the whole team."""
@@ -101,10 +102,12 @@ def _words(value: Value | None) -> str:
 def _read(log: Log) -> Keyed:
     at = (0, 0)
     for raw in log.raw():
-        message = decode(raw)
         if raw.schema == "foxglove.Grid":  # the map of the sync reply before it
-            yield (*at, _RANK["map handed out"], TEAM), builders.last_visit(message).tobytes()
-        elif raw.schema in _READERS:
+            grid = decode(raw, foxglove("Grid").Grid)
+            yield (*at, _RANK["map handed out"], TEAM), builders.last_visit(grid).tobytes()
+            continue
+        message = decode(raw)
+        if raw.schema in _READERS:
             yield from _READERS[raw.schema](message)
         if isinstance(message, Sync):
             at = (message.episode, message.tick)

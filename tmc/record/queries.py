@@ -11,25 +11,25 @@ import os
 from array import array
 from collections import defaultdict
 from collections.abc import Collection, Iterator
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from tmc.record.errors import RecordError
-from tmc.record.overfly_pb2 import Episode, FlightRecord
-from tmc.record.reader import Log, decode
+from tmc.record.overfly_pb2 import Episode, Events, FlightRecord, TeamMetrics
+from tmc.record.reader import Log
 from tmc.record.run_folder import tmc_log
 
 Folder = str | os.PathLike[str]
+M = TypeVar("M", bound=Message)
 _UNKNOWN = -1
 
 
-def messages(folder: Folder, *schemas: str) -> Iterator[Any]:
-    """Yield the messages of these schemas in tmc.mcap, in the order of the log."""
-    for raw in Log(tmc_log(folder)).raw():
-        if raw.schema in schemas:
-            yield decode(raw)
+def messages(folder: Folder, *kinds: type[M]) -> Iterator[M]:
+    """Return the messages of these types in tmc.mcap, in the order of the log."""
+    return Log(tmc_log(folder)).messages(*kinds)
 
 
 class Tracks:
@@ -67,7 +67,7 @@ def tracks(folder: Folder) -> dict[int, Tracks]:
     """Return {episode: tracks} of all flight records, in order of the episodes. A (uav, sequence) counts once."""
     found: dict[int, Tracks] = {}
     known: dict[int, set[int]] = defaultdict(set)
-    for record in messages(folder, "overfly.FlightRecord"):
+    for record in messages(folder, FlightRecord):
         if record.sequence not in known[record.uav]:
             known[record.uav].add(record.sequence)
             found.setdefault(record.episode, Tracks(record.episode)).add(record)
@@ -96,7 +96,7 @@ def digest(folder: Folder) -> str:
 def uncertainty(folder: Folder, episode: int) -> Iterator[tuple[int, float]]:
     """Return (tick, sum over cells of the uncertainty of the true map), in order of tick. Raises RecordError."""
     values: dict[int, dict[int, float]] = defaultdict(dict)
-    for m in messages(folder, "overfly.TeamMetrics"):
+    for m in messages(folder, TeamMetrics):
         values[m.episode].update(enumerate(m.uncertainty[:], start=m.first))
     _check_known(folder, episode, values)
     return iter(sorted(values[episode].items()))
@@ -105,9 +105,10 @@ def uncertainty(folder: Folder, episode: int) -> Iterator[tuple[int, float]]:
 def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
     """Return (tick, cell) of each event of scenario I, in that order; nothing in scenario II. Raises RecordError."""
     found: dict[int, set[tuple[int, int]]] = defaultdict(set)
-    for m in messages(folder, "overfly.Events", "overfly.Episode"):
+    found_messages: Iterator[Events | Episode] = messages(folder, Events, Episode)
+    for m in found_messages:
         events_found = found[m.episode]
-        if m.DESCRIPTOR.name == "Events":
+        if isinstance(m, Events):
             events_found.update(zip(m.ticks[:], m.cells[:], strict=True))
     _check_known(folder, episode, found)
     return iter(sorted(found[episode]))
@@ -115,7 +116,7 @@ def events(folder: Folder, episode: int) -> Iterator[tuple[int, int]]:
 
 def episodes(folder: Folder) -> list[Episode]:
     """Return the overfly.Episode messages, in the order of the log."""
-    return list(messages(folder, "overfly.Episode"))
+    return list(messages(folder, Episode))
 
 
 def _check_known(folder: Folder, episode: int, known: Collection[int]) -> None:

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import TypeVar, overload
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
+from google.protobuf.message import Message as ProtobufMessage
 from mcap.records import Attachment, Metadata
 
 from tmc.record.channels import ACTIVE, FORMAT
@@ -22,6 +23,8 @@ from tmc.record.mcap.salvage import intact_behind
 from tmc.record.mcap.strict import DamageError, contents
 from tmc.record.schemas import message_class
 
+M = TypeVar("M", bound=ProtobufMessage)
+
 
 @dataclass(frozen=True, slots=True)
 class LogMessage:
@@ -31,7 +34,7 @@ class LogMessage:
     log_time: int
     publish_time: int
     sequence: int
-    message: Any
+    message: ProtobufMessage
 
 
 class Log:
@@ -57,6 +60,13 @@ class Log:
         """Yield the intact messages in file order, decoded; of these topics only, when given."""
         for raw in self.raw(topics):
             yield LogMessage(raw.topic, raw.log_time, raw.publish_time, raw.sequence, decode(raw))
+
+    def messages(self, *kinds: type[M]) -> Iterator[M]:
+        """Yield the intact messages of these generated classes, such as `overfly_pb2.Sync`, in file order."""
+        wanted = {kind.DESCRIPTOR.full_name: kind for kind in kinds}
+        for raw in self.raw():
+            if raw.schema in wanted:
+                yield decode(raw, wanted[raw.schema])
 
     @property
     def damage(self) -> str | None:
@@ -152,10 +162,17 @@ def _check_start(path: Path) -> None:
         raise NoLogError(f"{path} is not an MCAP file: give one that ends in .mcap or .mcap{ACTIVE}")
 
 
-def decode(raw: Message) -> Any:
-    """Return the protobuf message: of Overfly's class where the schema is known, else of the class in the file."""
+@overload
+def decode(raw: Message) -> ProtobufMessage: ...
+@overload
+def decode(raw: Message, kind: type[M]) -> M: ...
+def decode(raw: Message, kind: type[ProtobufMessage] | None = None) -> ProtobufMessage:
+    """Return the protobuf message: of Overfly's class where the schema is known, else of the class in the file.
+
+    `kind`: the generated class of the schema, where the caller knows it. RecordError when the bytes are of another.
+    """
     try:
-        return _class(raw.schema, raw.definition.data if raw.definition else b"").FromString(raw.data)
+        return (kind or _class(raw.schema, raw.definition.data if raw.definition else b"")).FromString(raw.data)
     except (DecodeError, KeyError, TypeError):
         raise RecordError(
             f"a message on {raw.topic} is not an {raw.schema}: the log was made by another program"
@@ -163,7 +180,7 @@ def decode(raw: Message) -> Any:
 
 
 @cache
-def _class(schema: str, described: bytes) -> Any:
+def _class(schema: str, described: bytes) -> type[ProtobufMessage]:
     try:
         return message_class(schema)
     except RecordError:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tmc.record.builders import record_digest, to_record
 from tmc.record.channels import ACTIVE
+from tmc.record.overfly_pb2 import Episode, FlightRecord, TeamMetrics
 from tmc.record.reader import Log
 from tmc.record.run_folder import RunFolder
 
@@ -40,15 +41,15 @@ def check_delivery(out: Path, lost_before: Collection[RecordId] = ()) -> Deliver
     times: Counter[RecordId] = Counter()
     flown = Counter[str]()
     for entry in Log(_journal(out)).entries():
-        kind, message = entry.message.DESCRIPTOR.name, entry.message
-        if kind == "FlightRecord":
+        message = entry.message
+        if isinstance(message, FlightRecord):
             number = message.uav, message.sequence
             digests.setdefault(number, record_digest(to_record(message)))
             times[number] += 1
-        elif kind == "TeamMetrics":
+        elif isinstance(message, TeamMetrics):
             flown["ticks"] += len(message.uncertainty) - (message.first == 0)
             flown["updates"] = message.updates
-        elif kind == "Episode":
+        elif isinstance(message, Episode):
             flown["episodes"] += message.phase == "end"
     acks = set(_acks(out))
     lost = {number for number, digest in acks if digests.get(number) != digest} | {*lost_before}

@@ -15,7 +15,8 @@ from tmc.analysis.invariants.check import check as check_log
 from tmc.kernel.config import Config, build
 from tmc.kernel.world import World
 from tmc.record import queries
-from tmc.record.reader import read
+from tmc.record.overfly_pb2 import State
+from tmc.record.reader import Log
 from tmc.record.run_folder import run_files
 from tmc.wire import process
 
@@ -124,7 +125,7 @@ def _compare(result: TrialResult, world: World, policy: bytes | None, out: Path)
 
 def _states(out: Path) -> dict[int, tuple[str, str, int]]:
     """Return, by episode, the digests of the maps and of the replay memory, and its number of transitions."""
-    found = (entry.message for entry in read(run_files(out)["tmc"], {"/tmc/state"}))
+    found = Log(run_files(out)["tmc"]).messages(State)
     return {m.episode: (m.map, m.replay, m.transitions) for m in found}
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tmc.kernel.world import World
-from tmc.record import builders
+from tmc.record import builders, overfly_pb2
 from tmc.record.reader import LogMessage
+
+if TYPE_CHECKING:
+    from foxglove_schemas_protobuf.Grid_pb2 import Grid
 
 UNKNOWN = -1
 """In arrays by tick and UAV: no record holds the value."""
@@ -95,8 +98,8 @@ class EpisodeLog:
         self.syncs: list[Sync] = []
         self.metrics: list[Metrics] = []
         self.events: list[tuple[int, int]] = []
-        self.begins: list[Any] = []
-        self.ends: list[Any] = []
+        self.begins: list[overfly_pb2.Episode] = []
+        self.ends: list[overfly_pb2.Episode] = []
         self.lost: list[tuple[int, int, int]] = []
         self.anomalies: list[tuple[int | None, int | None, str]] = []
         self.reported = [-1] * self.N
@@ -125,7 +128,8 @@ class EpisodeCollector:
         for entry in entries:
             name = entry.message.DESCRIPTOR.full_name
             if name in _HANDLERS:
-                done = self._turn(entry.message.episode) if name != "foxglove.Grid" else None
+                number = getattr(entry.message, "episode", None)  # a map belongs to the exchange before it
+                done = None if number is None else self._turn(number)
                 if done is not None:
                     yield done
                 if self.episode is not None:
@@ -148,13 +152,13 @@ class EpisodeCollector:
         self.episode = EpisodeLog(self.world, number, self.before.copy())
         return done
 
-    def _lost(self, e: EpisodeLog, m: Any) -> None:
+    def _lost(self, e: EpisodeLog, m: overfly_pb2.Lost) -> None:
         if m.uav < e.N:
             e.lost.append((m.uav, m.tick, e.reported[m.uav]))
         else:
             e.anomalies.append((None, m.uav, f"it is lost, but a team of {e.N} has no UAV of this number"))
 
-    def _record(self, e: EpisodeLog, m: Any) -> None:
+    def _record(self, e: EpisodeLog, m: overfly_pb2.FlightRecord) -> None:
         why = misfit(e, m)
         if why:
             e.anomalies.append((m.tick, m.uav, why))
@@ -170,13 +174,13 @@ class EpisodeCollector:
         e.seen[i][0].extend(m.seen_tick[:])
         e.seen[i][1].extend(m.seen_cell[:])
 
-    def _sync(self, e: EpisodeLog, m: Any) -> None:
+    def _sync(self, e: EpisodeLog, m: overfly_pb2.Sync) -> None:
         e.syncs.append(
             Sync(m.tick, m.version, m.uavs[:], m.believed, list(e.reported), frozenset(i for i, *_ in e.lost))
         )
         self.before.version = m.version
 
-    def _grid(self, e: EpisodeLog, m: Any) -> None:
+    def _grid(self, e: EpisodeLog, m: Grid) -> None:
         if not e.syncs or e.syncs[-1].last_visit is not None:
             e.anomalies.append((None, None, "a map does not follow an exchange"))
             return
@@ -187,19 +191,19 @@ class EpisodeCollector:
             return
         e.syncs[-1].last_visit = builders.last_visit(m)
 
-    def _metrics(self, e: EpisodeLog, m: Any) -> None:
+    def _metrics(self, e: EpisodeLog, m: overfly_pb2.TeamMetrics) -> None:
         e.metrics.append(Metrics(m.first, m.steps, m.uncertainty[:], m.reward[:]))
 
-    def _events(self, e: EpisodeLog, m: Any) -> None:
+    def _events(self, e: EpisodeLog, m: overfly_pb2.Events) -> None:
         e.events += zip(m.ticks[:], m.cells[:], strict=False)
         if len(m.ticks) != len(m.cells):
             e.anomalies.append((None, None, f"{len(m.ticks)} ticks of events have {len(m.cells)} cells"))
 
-    def _episode(self, e: EpisodeLog, m: Any) -> None:
+    def _episode(self, e: EpisodeLog, m: overfly_pb2.Episode) -> None:
         (e.ends if m.phase == "end" else e.begins).append(m)
 
 
-def misfit(e: EpisodeLog, m: Any) -> str:
+def misfit(e: EpisodeLog, m: overfly_pb2.FlightRecord) -> str:
     """Return why a flight record does not fit the episode; empty when it does."""
     moves, size = m.tick - max(m.first, 1) + 1, e.world.grid.size
     if m.uav >= e.N:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from tmc.analysis.invariants.episode_log import UNKNOWN, EpisodeLog
 from tmc.analysis.invariants.result import InvariantResult, first_violation, where_first
 from tmc.kernel.grid import ACTIONS, STAY
 from tmc.kernel.reward import Block
+from tmc.record.overfly_pb2 import Episode
 
 Ints = NDArray[np.int64]
 Fault = tuple[int | None, int | None, str]
@@ -32,7 +32,7 @@ def episodes(e: EpisodeLog) -> InvariantResult:
     return first_violation(e, len(e.begins) + len(e.ends), faults)
 
 
-def _fresh(e: EpisodeLog, m: Any) -> bool:
+def _fresh(e: EpisodeLog, m: Episode) -> bool:
     sums = (m.ticks, m.uncertainty, m.uncertainty_per_cell, m.blocked_grid, m.blocked_obstacle, m.blocked_uav)
     return not any(sums) and list(m.reward) == [0.0] * e.N
 

@@ -10,6 +10,7 @@ from tmc.center import recovery
 from tmc.center.entries import JournalEntry
 from tmc.center.station import Station
 from tmc.kernel.world import World
+from tmc.record import overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log
 
@@ -35,7 +36,7 @@ def states(world: World, log: Log, show: Callable[[str, float], None]) -> Invari
         recovery.play(Station(world, "check", learning=False), log.raw(), log.path.parent, 0.0, watch=watch)
     except RecordError as error:
         violation = Violation(None, None, None, str(error))
-    logged = [entry.message for entry in log.entries(("/tmc/state",))]
+    logged = [*log.messages(overfly_pb2.State)]
     faults = (Violation(s.episode, None, None, what) for s in logged if s.episode in replayed
               for name, what in _DIGESTS.items() if getattr(s, name) != replayed[s.episode][name])  # fmt: skip
     return InvariantResult(len(_DIGESTS) * sum(s.episode in replayed for s in logged), next(faults, violation))

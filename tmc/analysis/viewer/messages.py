@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tmc.record.builders import FRAME
 from tmc.record.schemas import foxglove
 
 if TYPE_CHECKING:  # importing each takes milliseconds: see schemas.foxglove
+    from foxglove_schemas_protobuf.Color_pb2 import Color
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+    from foxglove_schemas_protobuf.Pose_pb2 import Pose
     from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
     from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -42,7 +44,8 @@ def pose_in_frame(at: Point, yaw: float, time_ns: int) -> PoseInFrame:
 
 def world_to_map(time_ns: int) -> FrameTransform:
     """Return the foxglove.FrameTransform that viewers need once: the identity."""
-    message: FrameTransform = foxglove("FrameTransform").FrameTransform(parent_frame_id=WORLD, child_frame_id=FRAME)
+    transform = foxglove("FrameTransform").FrameTransform
+    message: FrameTransform = transform(parent_frame_id=WORLD, child_frame_id=FRAME)
     message.timestamp.FromNanoseconds(time_ns)
     message.translation.x = message.translation.y = message.translation.z = 0.0
     message.rotation.w = 1.0
@@ -89,12 +92,12 @@ def entity_id(uav: int) -> str:
     return f"uav-{uav}"
 
 
-def _place(pose: Any, at: Point, z: float, yaw: float = 0.0) -> None:
+def _place(pose: Pose, at: Point, z: float, yaw: float = 0.0) -> None:
     pose.position.x, pose.position.y, pose.position.z = *at, z
     pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
 
 
-def _paint(color: Any, colour: str) -> None:
+def _paint(color: Color, colour: str) -> None:
     """Set a colour, given as `#RRGGBB`."""
     color.r, color.g, color.b = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
     color.a = 1.0

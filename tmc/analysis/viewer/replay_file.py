@@ -11,9 +11,10 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from tmc.analysis import palette
@@ -31,6 +32,11 @@ from tmc.record.errors import RecordError
 from tmc.record.mcap.export import Export
 from tmc.record.run_folder import RunFolder
 
+if TYPE_CHECKING:
+    from foxglove_schemas_protobuf.Grid_pb2 import Grid
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
 TICK_NS = 100_000_000
 """Log time per tick, ns."""
 TICK_S = 60
@@ -41,7 +47,7 @@ TERRAIN_Z_M = -1.0
 """Height of the terrain: below the maps, so that viewers draw them over it."""
 BLOCKED_BY = {Block.GRID: "the edge of the grid", Block.OBSTACLE: "an obstacle", Block.UAV: "another UAV"}
 
-Messages = Iterator[tuple[str, Any]]
+Messages = Iterator[tuple[str, Message]]
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,7 @@ def _once(timeline: Timeline) -> Messages:
         yield "/map/roads", builders.geojson(timeline.roads)
 
 
-def _grid(world: World, now: Maps, row: int) -> Any:
+def _grid(world: World, now: Maps, row: int) -> Grid:
     """Return a row of the maps over all cells; cells that are not monitored are 0."""
     last_visit, uncertainty = np.zeros(world.grid.size, "<u4"), np.zeros(world.grid.size, "<f4")
     last_visit[world.law.cells], uncertainty[world.law.cells] = now.last_visit[row], now.uncertainty[row]
@@ -112,7 +118,7 @@ def _grid(world: World, now: Maps, row: int) -> Any:
     return builders.layers(fields, world.grid.rows, world.grid.cols, world.map.cell_m, now.tick * TICK_NS)
 
 
-def _team_tick(timeline: Timeline, now: Maps) -> Any:
+def _team_tick(timeline: Timeline, now: Maps) -> overfly_pb2.TeamTick:
     t, cells, sums = now.tick, timeline.world.law.cells.size, now.sums
     return overfly_pb2.TeamTick(
         episode=timeline.episode, tick=t, uncertainty=sums[TRUE], uncertainty_per_cell=sums[TRUE] / cells,
@@ -155,7 +161,7 @@ def _heading(timeline: Timeline, t: int, uav: int) -> float:
     return math.atan2(-d_row, d_col)
 
 
-def _scene(timeline: Timeline, t: int, present: list[int]) -> Any:
+def _scene(timeline: Timeline, t: int, present: list[int]) -> SceneUpdate:
     world, first = timeline.world, max(0, t + 1 - TRAIL_TICKS)
     entities = []
     for uav in present:
@@ -179,7 +185,7 @@ def _log(timeline: Timeline, t: int, present: list[int]) -> Messages:
             yield "/log", _line("info", f"starts on cell {timeline.cells[0, uav]}", f"uav-{uav}", t)
 
 
-def _line(level: str, text: str, name: str, t: int) -> Any:
+def _line(level: str, text: str, name: str, t: int) -> Log:
     return builders.log_message(level, f"tick {t}: {text}", name, t * TICK_NS)
 
 

@@ -16,9 +16,11 @@ from tmc.analysis.run_data import UNKNOWN
 from tmc.kernel.grid import STAY
 from tmc.kernel.reward import Block
 from tmc.kernel.world import World
+from tmc.record import overfly_pb2
 from tmc.record.errors import RecordError
 from tmc.record.reader import Log, decode
 from tmc.record.run_folder import tmc_log
+from tmc.record.schemas import foxglove
 
 PROGRESS_MESSAGES = 10_000
 """Messages between two reports of progress."""
@@ -72,7 +74,7 @@ def read_timeline(folder: Path, episode: int, show: Callable[[str], None] = lamb
         if handler is not None and collector.add(decode(raw), handler):
             break  # the episode is over, so nothing of it follows
         if raw.topic == "/map/roads":
-            collector.roads = decode(raw).geojson
+            collector.roads = decode(raw, foxglove("GeoJSON").GeoJSON).geojson
         if number % PROGRESS_MESSAGES == 0:
             show(f"reading {path.name}: {number:,} messages")
     else:
@@ -109,7 +111,7 @@ class _Collector:
                 ) from None
         return message.episode == self.episode and getattr(message, "phase", "") == "end"
 
-    def _record(self, m: Any) -> None:
+    def _record(self, m: overfly_pb2.FlightRecord) -> None:
         self._check_cells(*m.cells, *m.seen_cell)
         if (
             len(m.cells) != m.tick - m.first + 1
@@ -127,23 +129,23 @@ class _Collector:
             seen[tick, m.uav].append(cell)
         self.seen |= seen
 
-    def _sync(self, m: Any) -> None:
+    def _sync(self, m: overfly_pb2.Sync) -> None:
         if max(m.uavs, default=0) >= self.cells.shape[1]:
             raise IndexError("more UAVs than the team has")
         self.answered[m.tick] = list(m.uavs)
 
-    def _metrics(self, m: Any) -> None:
+    def _metrics(self, m: overfly_pb2.TeamMetrics) -> None:
         ticks = slice(m.first, m.first + len(m.uncertainty))
         self.uncertainty[ticks], self.reward[ticks] = m.uncertainty, m.reward
 
-    def _events(self, m: Any) -> None:
+    def _events(self, m: overfly_pb2.Events) -> None:
         self._check_cells(*m.cells)
         events: dict[int, list[int]] = defaultdict(list)
         for tick, cell in zip(m.ticks, m.cells, strict=True):
             events[tick].append(cell)
         self.events |= events
 
-    def _ignore(self, _: Any) -> None:
+    def _ignore(self, _: overfly_pb2.Episode) -> None:
         """Add nothing: only the phase of the message matters, in `add`."""
 
     def _check_cells(self, *cells: int) -> None:
