@@ -66,7 +66,7 @@ UNKNOWN = [
         ("fly", "planner:greedy", "planner:random"),
         "'planner:random' is one argument too many; see `overfly fly --help`",
     ),
-    (("fly",), "the following arguments are required: who; see `overfly fly --help`"),
+    (("fly",), "the following arguments are required: POLICY; see `overfly fly --help`"),
     (("run", "paper", "--seed"), "argument --seed: expected one argument; see `overfly run --help`"),
 ]
 
