@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +18,7 @@ from tmc.kernel.grid import Grid
 from tmc.kernel.rastertext import parse_text
 from tmc.record import compare
 from tmc.record.overfly_pb2 import UavStatus
-from tmc.record.reader import Log, read
+from tmc.record.reader import read
 from tmc.record.writer import LogWriter
 
 TOWN = "\n".join(["#######", "#..X..#", "#.###.#", "#.#X#.#", "#######", ""])
@@ -203,7 +204,8 @@ def test_a_lead_that_no_rule_allows_is_seen(monkeypatch: pytest.MonkeyPatch, tmp
     facts = {(1, t, compare.KINDS.index("cell"), i): 10 + i for t in range(10) for i in range(2)}
     status = UavStatus(lead_most=5, lead_tick=7, lead_bound="distance")
     monkeypatch.setattr(asynchrony, "run_files", lambda _: {"uav-001": tmp_path})
-    monkeypatch.setattr(Log, "messages", lambda *_: iter([status]))
+    log = SimpleNamespace(messages=lambda _kind: iter([status]))
+    monkeypatch.setattr(asynchrony, "Log", lambda _file: log)
     lead = asynchrony.farthest(config, facts, tmp_path, 0)
     assert (lead.ticks, lead.uav, lead.at_tick, lead.cells, lead.allowed) == (5, 1, 7, 1, False)
     result = asynchrony.Result(asynchrony.TRIALS[3], 0, lead, 1.0, None)
