@@ -215,7 +215,7 @@ def text(rows: Sequence[Row], config: Config) -> str:
         f"mean of {rows[0].seeds} seeds with its 95 % interval. x bound: against a lower bound that no team can beat.",
         "blocked: moves refused in a mission; collisions: those of them that another UAV stood in the way of.",
         "",
-        f"{'who':<32} {'N':>3} {'uncertainty':>18} {'x bound':>8} {'collisions':>11} {'blocked':>8} {'seconds':>8}",
+        f"{'policy':<32} {'N':>3} {'uncertainty':>18} {'x bound':>8} {'collisions':>11} {'blocked':>8} {'seconds':>8}",
     ]
     for r in rows:
         times = "-" if math.isnan(r.times_bound) else f"{r.times_bound:.3f}"
